@@ -33,7 +33,6 @@ from typing import NamedTuple
 import psutil
 
 from apps.captures.info import report as contents_of
-from apps.captures.reader import Capture
 from apps.captures.reexecute import describe_result, reexecute
 from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
@@ -44,6 +43,7 @@ from bench.trials import number_of, one_of, sized
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
 from cocoro.errors import CocoroError
 from cocoro.keys import recorder_key

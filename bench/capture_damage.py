@@ -15,7 +15,6 @@ from collections import defaultdict
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
-from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main as cocoro
 from apps.rehearsal.rehearse import rehearse
@@ -23,6 +22,7 @@ from apps.rehearsal.request import RehearsalRequest
 from bench.report import Report, Table
 from bench.trials import Runs, number_of, sized
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from services.capture.packing import Packer
 from services.executive.tasks import FetchTask

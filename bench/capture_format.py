@@ -30,13 +30,13 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PackageWriter
 
-from apps.captures.contents import unpacked
-from apps.captures.reader import Capture
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from bench.report import Report, Table, number, turns
 from bench.trials import number_of, one_of, sized
 from cocoro.capture import mcap
+from cocoro.capture.contents import unpacked
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import CocoroError
 from services.capture import file, packing

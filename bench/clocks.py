@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apps.captures.reader import Capture
 from apps.rehearsal.request import RehearsalRequest
 from bench.pursuit import LABEL, travels
 from bench.report import Report
 from bench.trials import Runs, add_frames, add_jobs, sized
 from cocoro import topics
 from cocoro.arrays import FloatArray
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.robot import Robot

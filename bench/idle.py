@@ -15,14 +15,14 @@ from pathlib import Path
 import psutil
 
 from apps.captures.info import missing_of
-from apps.captures.reader import Capture
 from bench.live import NAME, operator
 from bench.report import Report, Table, number
 from bench.trials import sized
+from cocoro.capture.folder import captures
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import CocoroError
 from services.capture.file import LARGE_BYTES
-from services.capture.folder import captures
 from services.capture.packing import Packer
 
 START_S = 5.0

@@ -11,9 +11,9 @@ import re
 from pathlib import Path
 
 from apps.captures.latency import latency
-from apps.captures.reader import Capture
 from bench.live import NAME, Operator, operator
 from bench.report import Report, Table, number
+from cocoro.capture.reader import Capture
 from cocoro.errors import CocoroError
 
 STAGES = ("perception", "planning", "pixel to motor")

@@ -20,7 +20,7 @@ their modules, such as `cocoro.component`. Names that are not listed here are in
 - Errors: `CocoroError` and its kinds; a command prints their text without a traceback.
 
 Parts with a module of their own: `cocoro.topics` (the project's topics and requests), `cocoro.messages` (their types),
-`cocoro.testing` (components under test), `cocoro.capture` (the format of captures; `apps.captures.reader` reads them),
+`cocoro.testing` (components under test), `cocoro.capture` (the format of captures; `cocoro.capture.reader` reads them),
 `cocoro.kinematics`, `cocoro.learning`, `cocoro.arrays` and `cocoro.units` (types).
 """
 

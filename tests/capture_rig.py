@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
-from apps.captures.reader import Capture, Record
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
+from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
 from cocoro.messages import BaseState, Frame

@@ -10,10 +10,10 @@ import pytest
 from capture_rig import all_of, entry, writer
 
 from apps.captures.info import report
-from apps.captures.reader import Capture
 from apps.cli import capture as capture_command
+from cocoro.capture.folder import captures, file_name, make_room
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS, steady_ns
-from services.capture.folder import captures, file_name, make_room
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
 from services.capture.writer import FileLimits
 

@@ -17,10 +17,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_conformance import CONTENTS, MAGIC, made, variants
 
 from apps.captures.info import report
-from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
 from cocoro.capture.conventions import checksum
+from cocoro.capture.reader import Capture
 from services.capture.packing import Packer
 
 FILES = dict(variants())

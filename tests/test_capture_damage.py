@@ -12,10 +12,10 @@ import pytest
 from capture_rig import all_of, drive, record
 
 from apps.captures.info import report
-from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture, Record
 from services.capture.packing import Packer
 
 pytestmark = pytest.mark.sweep

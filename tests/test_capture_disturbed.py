@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from capture_rig import Room, all_of, drive, entry, writer
 
-from apps.captures.reader import Capture
 from cocoro import topics
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.messages import Recording
 from cocoro.vloop import run_virtual
 from services.capture.writer import KEPT_DISTURBED, LOOK_S, CaptureWriter, FileLimits, describe_disturbance, locate

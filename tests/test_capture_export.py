@@ -14,10 +14,10 @@ from capture_rig import Room, drive, record
 
 from apps.captures.export import tables, video
 from apps.captures.export.geometry import about_z
-from apps.captures.reader import Capture
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.messages import Frame, PlannerStatus, TargetEstimate, TrueObject, Truth
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"

@@ -21,17 +21,17 @@ from message_samples import data_of
 
 from apps.captures.compare import changes, known_to
 from apps.captures.info import report
-from apps.captures.mcap_reading import unpack
-from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.folder import captures, make_room
 from cocoro.capture.mcap import MESSAGE_HEAD
+from cocoro.capture.mcap_reading import unpack
+from cocoro.capture.reader import Capture
 from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
 from services.capture.file import LARGE_BYTES
-from services.capture.folder import captures, make_room
 from services.capture.keys import KeyFilter, lossy
 from services.capture.packing import COMPRESSIONS, Compression, Packer, message_head
 from services.capture.writer import FileLimits, Missing

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from apps.captures.reader import Capture
+from cocoro.capture.reader import Capture
 
 HERE = Path(__file__).parent
 GOLDEN = HERE / "golden" / "fetch.mcap"

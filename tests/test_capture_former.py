@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from apps.captures.info import report
-from apps.captures.reader import Capture
 from cocoro.capture.former import todays_payload
+from cocoro.capture.reader import Capture
 from cocoro.messages import ClockTick, Exchange, Intent, TaskRequest
 from services.executive.tasks import TASKS, GoToTask
 

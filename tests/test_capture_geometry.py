@@ -11,7 +11,7 @@ from capture_rig import ROBOT
 
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
-from apps.captures.reader import Capture
+from cocoro.capture.reader import Capture
 from cocoro.kinematics import turn_z
 from cocoro.messages import Frame, ServoState
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from apps.captures.latency import Latency, latency
-from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import info_in
 from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture, Record
 from cocoro.topics import BASE_COMMAND, DETECTIONS, FRAME, STEPS, Topic
 from services.capture.keys import QueuedMessage
 from services.capture.packing import Packer

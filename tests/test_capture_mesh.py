@@ -19,13 +19,13 @@ import pytest
 from capture_rig import STILL, all_of, drive, record
 
 from apps.captures.info import report
-from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from apps.cli import capture as capture_command
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
 from cocoro.keys import recorder_key
 from cocoro.messages import BaseState

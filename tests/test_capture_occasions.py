@@ -16,19 +16,20 @@ from mcap.stream_reader import StreamReader
 from msgspec import structs
 
 from apps.captures.info import missing_of, report
-from apps.captures.reader import Capture
 from apps.captures.recorded import Once
 from cocoro import topics
 from cocoro.bus.base import Qos
+from cocoro.capture.folder import RecordingFolder, captures, make_room, parsed_name, pin_of
+from cocoro.capture.occasion import Occasion, occasion_of
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import BaseState, Health, Latch, Recording, ServoState, TaskState, TopicHealth
 from cocoro.node import Node
 from cocoro.vloop import run_virtual
 from deploy import profiles
 from services.capture.config import CaptureConfig
-from services.capture.folder import RecordingFolder, captures, make_room, parsed_name, pin_of
 from services.capture.keys import QueuedMessage, info_of
-from services.capture.occasions import Occasion, Watch, occasion_of
+from services.capture.occasions import Watch
 from services.capture.packing import Compression, Packer
 from services.capture.thinning import ThinningLimits, ThinningWriter
 from services.capture.writer import FileLimits, Missing

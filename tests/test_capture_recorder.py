@@ -15,10 +15,10 @@ import msgspec
 import pytest
 from capture_rig import ROBOT, STILL, Room, all_of, drive, entry, record, writer
 
-from apps.captures.reader import Capture
 from cocoro import topics
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS, FollowedClock
 from cocoro.component import load
 from cocoro.core import Sample, Schedule, Take

@@ -15,12 +15,12 @@ import pytest
 from capture_rig import Room, drive, record
 
 from apps.captures.compare import difference
-from apps.captures.reader import Capture, Record
 from apps.captures.reexecute import ReexecutionResult, reexecute
 from apps.captures.rewrite import info_in, rewrite
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus

@@ -11,12 +11,12 @@ import msgspec
 import pytest
 from test_capture_reexecute import GOLDEN, TOLERANCE, again
 
-from apps.captures.reader import Capture
 from apps.captures.recorded import origins
 from apps.captures.reexecute import describe_result
 from apps.captures.rewrite import info_in
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from services.capture.keys import QueuedMessage
 from services.capture.packing import Packer
 from services.capture.writer import CaptureWriter, FileLimits

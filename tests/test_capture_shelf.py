@@ -14,12 +14,12 @@ from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.main import main
 from apps.cli.status import space
+from cocoro.capture.folder import is_pinned
+from cocoro.capture.occasion import OCCASION, Occasion
 from cocoro.clock import NS
 from cocoro.messages import Recording
 from deploy.rundir import RunDir
 from services.capture.file import CaptureFile
-from services.capture.folder import is_pinned
-from services.capture.occasions import OCCASION, Occasion
 from services.capture.packing import Packer
 from services.capture.writer import sync_and_close
 

@@ -18,9 +18,9 @@ from mcap.records import Attachment, Channel
 from mcap.writer import CompressionType, Writer
 
 from apps.captures.info import report
-from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.mcap import MAGIC, PREFIX
+from cocoro.capture.reader import Capture
 from services.capture.file import CaptureFile
 from services.capture.packing import Packer
 from services.capture.writer import FileLimits, sync_and_close

@@ -24,10 +24,10 @@ from cli_forks import FULL, NO_MOUNTS, TALKED, Forks
 from cli_surroundings import ARGUMENTS, COMMANDS, GOLDEN, NOT_UTF8, SURROUNDINGS, Surroundings, Table, wrong
 from places import in_short_folder
 
-from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from apps.cli import exits
 from apps.cli.main import failed
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.packing import Packer
 

@@ -15,11 +15,11 @@ from capture_rig import ROBOT, Room, drive, frame, record
 from apps.captures.export import video
 from apps.captures.export.geometry import about_z
 from apps.captures.export.outside import CameraPath
-from apps.captures.reader import Capture
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError
 from cocoro.messages import TrueObject, Truth
 from sim.outside import OutsideStage

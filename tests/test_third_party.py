@@ -19,7 +19,6 @@ from capture_rig import STILL, Room, all_of, record
 from third_party import NAME, forget_third_parties, install, on_path
 
 from apps.captures.player import Player
-from apps.captures.reader import Capture
 from apps.captures.reexecute import reexecute
 from apps.captures.replay import Replay, played_keys
 from apps.cli.echo import read
@@ -27,6 +26,7 @@ from apps.cli.listening import takes_frames
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
+from cocoro.capture.reader import Capture
 from cocoro.component import Component, load
 from cocoro.errors import ConfigError
 from cocoro.installed import topic_named

@@ -8,11 +8,11 @@ from typing import Any
 import msgspec
 
 from apps.captures.compare import changes
-from apps.captures.reader import Capture
 from cocoro.capture import mcap
 from cocoro.capture.conventions import TALLY, KeyTally, tally_names
 from cocoro.capture.former import is_former, todays_name
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.reader import Capture
 from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
 from cocoro.clock import NS
 from cocoro.installed import topic_named

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from apps.captures.reader import Capture
 from apps.captures.recorded import Once, steps_of
 from cocoro.arrays import FloatArray
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.capture.types import MessageHead
 from cocoro.messages import Detections, StepRecord
 from cocoro.topics import BASE_COMMAND, DETECTIONS, FRAME

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from cocoro.capture.folder import IDLE, default_folder, parsed_name
 from cocoro.errors import CocoroError
 from deploy.rundir import RunDir, robots
-from services.capture.folder import IDLE, default_folder, parsed_name
 
 LATEST = "latest"
 

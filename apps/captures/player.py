@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from apps.captures.reader import Capture, Record
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE
 from cocoro.clock import NS
 from cocoro.topics import FRAME

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from apps.captures.reader import Capture, Record
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, PLANNING_MODULE
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import LossyFrame, MessageHead, NotReadableError
 from cocoro.clock import NS
 from cocoro.component import Implementation

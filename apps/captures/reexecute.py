@@ -15,8 +15,8 @@ import msgspec
 
 from apps.captures.compare import difference, known_to
 from apps.captures.info import changed_since, missing_of
-from apps.captures.reader import Capture
 from apps.captures.recorded import FoundMessage, MessageId, Origin, RecordedStep, origins, steps_of, with_messages
+from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample

@@ -16,9 +16,9 @@ from typing import Any
 import msgspec
 
 from apps.captures.player import Player
-from apps.captures.reader import Capture, Record
 from cocoro.bus.base import Bus, Handle, Qos, RawPublisher
 from cocoro.capture.former import todays_name, todays_payload
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of

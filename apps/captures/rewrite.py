@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from apps.captures.info import missing_of
-from apps.captures.reader import Capture, Record
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import TypeSchema
 from services.capture.file import CaptureFile
 from services.capture.keys import KeyInfo

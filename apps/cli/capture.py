@@ -16,7 +16,6 @@ import typer
 
 from apps.captures import shelf as captures
 from apps.captures.info import AttachmentReport, CaptureReport, report
-from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import completions, exits, shelf
 from apps.cli.options import (
@@ -32,11 +31,12 @@ from apps.cli.options import (
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.occasion import OCCASION, Occasion
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError, choice_of
 from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
-from services.capture.occasions import OCCASION, Occasion
 from services.capture.packing import COMPRESSIONS, Compression, Packer
 
 MB = 1e6

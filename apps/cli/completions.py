@@ -111,7 +111,7 @@ def of(*names: str) -> Callable[[str], list[str]]:
 def captures() -> Iterable[str]:
     """Names of captures, and of the tasks in them."""
     from apps.captures.names import shelf
-    from services.capture.folder import IDLE, parsed_name
+    from cocoro.capture.folder import IDLE, parsed_name
 
     there = shelf()
     labels = (name.label for _, path in there if (name := parsed_name(path)) and name.label not in ("", IDLE))

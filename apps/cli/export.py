@@ -12,10 +12,10 @@ import typer
 
 from apps.captures.export.files import refuse_existing
 from apps.captures.info import left_out_notes
-from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.options import CameraOption, CaptureArgument, JsonOption
 from apps.cli.output import print_json
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 

@@ -20,7 +20,7 @@ ENVIRONMENT = {
     "COCORO_CAPTURE_DIR": "Folder of the captures.",
     "COCORO_LOG_DIR": "Folder of the logs, if it is not the run directory.",
     "COCORO_STATE_DIR": "Folder of the emergency stop's latch, which outlives a reboot.",
-    "COCORO_DEBUG_GRACE_S": "With `up`: kill a process that hangs after so many seconds, not 10 (stopped: 2.5); 0 for never.",
+    "COCORO_DEBUG_GRACE_S": "With `up`: kill what hangs after so many seconds, not 10 (stopped: 2.5); 0 for never.",
     "COCORO_SITE": "Folder of the site; by default the current one if it has a site.toml.",
     "COCORO_LOG": "Level of the logs; `debug` also shows the traceback of an internal error.",
 }

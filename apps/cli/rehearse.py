@@ -38,8 +38,8 @@ def rehearse(
     if video is None:
         return _run(request, as_json)
     from apps.captures.export import video as films  # imports much
-    from apps.captures.reader import Capture
     from apps.cli.export import film
+    from cocoro.capture.reader import Capture
 
     films.camera_of(camera)
     films.check(video)

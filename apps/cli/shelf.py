@@ -17,10 +17,11 @@ from apps.cli.options import JsonOption, capture_file
 from apps.cli.output import complain, print_json
 from apps.cli.terminal import Column, print_table
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.folder import IDLE, delete, is_pinned, pin_of
+from cocoro.capture.listed import ListedCapture
 from cocoro.clock import NS
 from cocoro.errors import RefusedError
 from deploy.rundir import robots
-from services.capture.folder import IDLE, delete, is_pinned, pin_of
 
 MB = 1e6
 COLUMNS = (
@@ -59,7 +60,7 @@ def list_captures(
     print(_summary(found, len(shown)))
 
 
-def _row(each: shelf.ListedCapture) -> tuple[str, ...]:
+def _row(each: ListedCapture) -> tuple[str, ...]:
     began = f"{datetime.fromtimestamp(each.began_ns / NS):%Y-%m-%d %H:%M}" if each.began_ns else ""
     return (
         each.name,
@@ -73,13 +74,13 @@ def _row(each: shelf.ListedCapture) -> tuple[str, ...]:
     )
 
 
-def _outcome(each: shelf.ListedCapture) -> str:
+def _outcome(each: ListedCapture) -> str:
     if each.outcome:
         return each.outcome + (f": {each.reason.partition(':')[0]}" if each.reason else "")
     return "" if each.closed else "not closed"
 
 
-def _summary(found: list[shelf.ListedCapture], shown: int) -> str:
+def _summary(found: list[ListedCapture], shown: int) -> str:
     more = f"; {len(found) - shown} more, --all shows them" if shown < len(found) else ""
     pinned = sum(each.size_bytes for each in found if each.pinned)
     of_it = f", {_size(pinned)} of them pinned" if pinned else ""

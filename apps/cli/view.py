@@ -17,7 +17,6 @@ import typer
 
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
 from apps.captures.info import left_out_notes
-from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.export import progress_bar
 from apps.cli.interrupt import interrupt_event
@@ -25,6 +24,7 @@ from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice, RobotOption, ThroughOption, capture_file
 from cocoro.bus.base import Bus, Payload
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError
 from cocoro.messages import AboutRequest, Message
 from cocoro.topics import ABOUT, FRAME, TOPICS, Topic

@@ -8,8 +8,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from cocoro.capture.folder import default_folder
 from cocoro.units import Positive
-from services.capture.folder import default_folder
 from services.capture.packing import Compression
 
 

@@ -16,6 +16,7 @@ import msgspec
 
 from cocoro.about import versions
 from cocoro.bus.base import Handle, Payload, Received
+from cocoro.capture.occasion import Occasion
 from cocoro.capture.types import Alive, MessageHead
 from cocoro.clock import NS, Clock
 from cocoro.errors import MeshError, RemoteError
@@ -27,7 +28,7 @@ from cocoro.stream_checks import ANY_HZ, SequenceTracker
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, KeyFilter, KeyInfo, QueuedMessage
 from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
-from services.capture.occasions import Occasion, OccasionNews, Watch
+from services.capture.occasions import OccasionNews, Watch
 from services.capture.sink import RecordingProgress, RecordingSink
 from services.capture.writer import Missing, describe_disturbance
 

@@ -9,11 +9,11 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from cocoro.capture.folder import RecordingFolder
 from cocoro.clock import NS
 from cocoro.component import Implementation
 from cocoro.node import Node
 from services.capture.config import CaptureConfig, folder_of
-from services.capture.folder import RecordingFolder
 from services.capture.keys import KeyFilter, KeyInfo, info_of, lossy
 from services.capture.log_clock import LogClock
 from services.capture.packing import Packer

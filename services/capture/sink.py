@@ -12,10 +12,11 @@ from contextlib import suppress
 from typing import NamedTuple, Protocol
 
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.occasion import Occasion
 from cocoro.messages import DisturbedFile
 from services.capture.file import LARGE_BYTES
 from services.capture.keys import QueuedMessage
-from services.capture.occasions import Occasion, OccasionNews
+from services.capture.occasions import OccasionNews
 from services.capture.writer import CaptureWriter, sync
 
 log = logging.getLogger(__name__)

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 
 from cocoro.bus.base import Qos
 from cocoro.capture.conventions import LEFT_OUT
+from cocoro.capture.folder import IDLE, RecordingFolder
+from cocoro.capture.occasion import OCCASION, Occasion
 from cocoro.clock import NS
 from cocoro.installed import topic_named
 from services.capture.file import LARGE_BYTES
-from services.capture.folder import IDLE, RecordingFolder
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
-from services.capture.occasions import OCCASION, Occasion, OccasionNews
+from services.capture.occasions import OccasionNews
 from services.capture.packing import PackedMessage, Packer
 from services.capture.writer import CaptureWriter, FileLimits, Missing, sync_and_close
 

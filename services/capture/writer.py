@@ -14,12 +14,13 @@ from typing import Literal, NamedTuple
 from mcap.records import Channel, Schema
 
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.occasion import Occasion
 from cocoro.capture.types import TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
 from services.capture.file import CaptureFile
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
-from services.capture.occasions import Occasion, OccasionNews
+from services.capture.occasions import OccasionNews
 from services.capture.packing import PackedMessage, Packer
 
 MB = 1_000_000

@@ -9,11 +9,11 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from apps.captures.reader import Capture
 from apps.captures.reexecute import describe_result, reexecute
 from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.keys import KeyFilter
 from services.capture.packing import Packer

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from apps.captures.reader import Capture
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.reader import Capture
 
 
 def refuse_existing(out: Path) -> None:

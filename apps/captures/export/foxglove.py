@@ -18,11 +18,11 @@ import numpy as np
 from apps.captures.export import geometry
 from apps.captures.export.files import making
 from apps.captures.export.story import PhaseNews, catalogue_of, robot_of
-from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import info_in
 from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import JSON, NotReadableError, TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import (

@@ -13,9 +13,9 @@ import scipy  # loads its parts when they are needed
 
 from apps.captures.export.stage import recorded_stage
 from apps.captures.export.story import Story, read
-from apps.captures.reader import Capture
 from cocoro.arrays import FloatArray, ImageArray
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import Truth
 from cocoro.topics import TRUTH

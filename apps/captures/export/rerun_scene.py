@@ -16,9 +16,9 @@ import numpy as np
 from apps.captures.export import geometry
 from apps.captures.export.files import making
 from apps.captures.export.story import PhaseNews, catalogue_of, robot_of
-from apps.captures.reader import Capture
 from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import (

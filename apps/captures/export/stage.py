@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import json
 
-from apps.captures.reader import Capture
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError
 from cocoro.messages import AboutReply
 from cocoro.robot import Robot

@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from apps.captures.export.geometry import in_body
-from apps.captures.reader import Capture, Record
+from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import Detections, Message, PlannerStatus, TaskState, TrueObject, Truth

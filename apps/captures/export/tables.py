@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from apps.captures.export.story import beliefs
-from apps.captures.reader import Capture
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 
 LONGEST_LIST = 16

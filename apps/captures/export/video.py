@@ -18,10 +18,10 @@ import cv2
 
 from apps.captures.export.files import making, refuse_existing
 from apps.captures.export.story import Story, catalogue_of, read
-from apps.captures.reader import Capture
 from apps.pictures import captioned, draw
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.topics import FRAME

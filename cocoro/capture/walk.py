@@ -21,11 +21,10 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from apps.captures import mcap_reading
-from apps.captures.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
-from apps.captures.mcap_reading import KNOWN
-from cocoro.capture import mcap
+from cocoro.capture import mcap, mcap_reading
+from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
 from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
+from cocoro.capture.mcap_reading import KNOWN
 
 RUN_BYTES = 1 << 20
 """A run of messages outside of chunks ends at this size, which bounds a reader's memory."""

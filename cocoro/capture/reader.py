@@ -29,12 +29,11 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistics
 
-from apps.captures import mcap_reading
-from apps.captures.contents import Contents, Disk, MessageBlock, miscounted, read_block
-from apps.captures.scan import contents, front_to_back
-from cocoro.capture import mcap
+from cocoro.capture import mcap, mcap_reading
+from cocoro.capture.contents import Contents, Disk, MessageBlock, miscounted, read_block
 from cocoro.capture.conventions import CHECKSUM, LEFT_OUT, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
+from cocoro.capture.scan import contents, front_to_back
 from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 from cocoro.keys import matches
 

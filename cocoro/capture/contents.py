@@ -11,10 +11,10 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
-from apps.captures.mcap_reading import LARGEST_CHUNK, unpack
 from cocoro.capture import mcap
 from cocoro.capture.conventions import CHECKSUM, MAKER, PROFILE, TALLY, checksum
 from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
+from cocoro.capture.mcap_reading import LARGEST_CHUNK, unpack
 
 LARGEST_RECORD = 1 << 28
 """Bytes of records other than chunks, messages and attachments. A record that claims more is damaged."""

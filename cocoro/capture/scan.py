@@ -16,11 +16,10 @@ from collections.abc import Iterator
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
-from apps.captures import mcap_reading
-from apps.captures.contents import Contents, Disk, MessageBlock, compare, read_chunk, read_header
-from apps.captures.walk import Walk
-from cocoro.capture import mcap
+from cocoro.capture import mcap, mcap_reading
+from cocoro.capture.contents import Contents, Disk, MessageBlock, compare, read_chunk, read_header
 from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
+from cocoro.capture.walk import Walk
 
 LARGEST_SUMMARY = 1 << 30
 _SEARCHED = 1 << 20
