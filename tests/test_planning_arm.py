@@ -249,6 +249,26 @@ def test_an_arm_that_is_held_up_is_not_left_behind() -> None:
     assert lead.max() <= CONFIG.arm.lead_rad + 2.5 * TICK_S
 
 
+def test_while_states_are_late_the_goals_of_all_joints_wait_so_that_the_hand_stays_on_its_way() -> None:
+    arm = Arm(dict(READY))
+    goal = HandPose(0.5, 0.0, 0.06, CONFIG.arm.pitch_rad)
+    for _ in range(15):
+        step = arm.controller.reach(goal, 0.35, arm.angles, TICK_S)
+        arm.angles = arm.angles | dict(zip(ARM, step.goal_rad.tolist(), strict=True))
+    late, waiting = dict(arm.angles), []
+    for _ in range(round(0.4 / TICK_S)):
+        step = arm.controller.reach(goal, 0.35, late, TICK_S)
+        waiting.append(step.goal_rad)
+    lead = np.abs(np.array(waiting) - np.array([late[name] for name in ARM])).max(axis=1)
+    assert lead.max() <= CONFIG.arm.wait_rad + 2.5 * TICK_S
+    assert lead[-1] > CONFIG.arm.wait_rad, "they did wait"
+    assert np.array_equal(waiting[-1], waiting[-5])
+    assert not step.blocked
+    for _ in range(round(0.4 / TICK_S)):
+        step = arm.controller.reach(goal, 0.35, late, TICK_S)
+    assert not np.array_equal(step.goal_rad, waiting[-1]), "what is held up for longer is no delay"
+
+
 def test_holding_holds_what_was_commanded_last() -> None:
     arm = Arm(dict(READY))
     arm.go(lambda: arm.controller.reach(HandPose(0.45, 0.0, 0.1, CONFIG.arm.pitch_rad), 0.25, arm.angles, TICK_S), 0.2)
