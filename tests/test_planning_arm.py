@@ -250,23 +250,19 @@ def test_an_arm_that_is_held_up_is_not_left_behind() -> None:
 
 
 def test_while_states_are_late_the_goals_of_all_joints_wait_so_that_the_hand_stays_on_its_way() -> None:
-    arm = Arm(dict(READY))
-    goal = HandPose(0.5, 0.0, 0.06, CONFIG.arm.pitch_rad)
-    for _ in range(15):
-        step = arm.controller.reach(goal, 0.35, arm.angles, TICK_S)
-        arm.angles = arm.angles | dict(zip(ARM, step.goal_rad.tolist(), strict=True))
-    late, waiting = dict(arm.angles), []
-    for _ in range(round(0.4 / TICK_S)):
-        step = arm.controller.reach(goal, 0.35, late, TICK_S)
-        waiting.append(step.goal_rad)
-    lead = np.abs(np.array(waiting) - np.array([late[name] for name in ARM])).max(axis=1)
-    assert lead.max() <= CONFIG.arm.wait_rad + 2.5 * TICK_S
-    assert lead[-1] > CONFIG.arm.wait_rad, "they did wait"
-    assert np.array_equal(waiting[-1], waiting[-5])
-    assert not step.blocked
-    for _ in range(round(0.4 / TICK_S)):
-        step = arm.controller.reach(goal, 0.35, late, TICK_S)
-    assert not np.array_equal(step.goal_rad, waiting[-1]), "what is held up for longer is no delay"
+    controller = ArmController(ROBOT, CONFIG.arm, REACHER)
+    late = np.array([PARKED[name] for name in ARM])
+
+    def goals(seconds: float) -> FloatArray:
+        to = HandPose(0.37, 0.0, 0.2, CONFIG.arm.pitch_rad)
+        steps = [controller.reach(to, 0.25, PARKED, TICK_S) for _ in range(round(seconds / TICK_S))]
+        assert not any(step.blocked for step in steps)
+        return np.array([step.goal_rad for step in steps])
+
+    waiting = goals(CONFIG.arm.wait_s)
+    assert CONFIG.arm.wait_rad < np.abs(waiting - late).max() <= CONFIG.arm.wait_rad + 2.5 * TICK_S
+    assert (waiting[-5:] == waiting[-1]).all()
+    assert not np.array_equal(goals(0.1)[-1], waiting[-1]), "what is held up for longer is no delay"
 
 
 def test_holding_holds_what_was_commanded_last() -> None:
