@@ -105,6 +105,8 @@ class Request(Generic[Q, R]):
     """Questions and answers are published for recorders, unless this is False."""
     qos: Qos = Qos.COMMAND
     """Of question and answer."""
+    most_hz: float = 40.0
+    """How often a person's link to a site may ask it; what follows the last one sooner is dropped, without an answer."""
 
     @property
     def server(self) -> str:
@@ -301,7 +303,7 @@ ABOUT = Request(
 TIME = Request(
     "{service}/time", m.TimeRequest, m.TimeReply,
     "The robot's time on a host, from its gateway; hosts and persons compare their clocks by it.",
-    timeout_s=1.0, right="see", recorded=False,
+    timeout_s=1.0, right="see", recorded=False, most_hz=1000.0,
 )  # fmt: skip
 
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)

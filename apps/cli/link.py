@@ -134,6 +134,7 @@ async def joined(
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
         link = MeshLink(run_dir, bus, private=config.directory is not None, refusal=refusal)
+        link.paced = refusal is not None
         if refusal is not None and not await link.alive():
             why = "is it up there, or has your certificate been revoked?"
             raise MeshError(f"nothing of {link.robot} is heard at {config.where}: {why}")
