@@ -106,7 +106,7 @@ class Request(Generic[Q, R]):
     qos: Qos = Qos.COMMAND
     """Of question and answer."""
     most_hz: float = 40.0
-    """How often a person's link to a site may ask it; what follows the last one sooner is dropped, without an answer."""
+    """How often a person's link to a site may ask it; what follows the last one sooner gets no answer."""
 
     @property
     def server(self) -> str:
@@ -268,7 +268,7 @@ OBJECTS = Request(
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch the emergency stop; answered by each service that moves something, and by the executive.",
-    timeout_s=1.0, right="stop",
+    timeout_s=1.0, right="stop", most_hz=200.0,
 )  # fmt: skip
 RESET = Request(
     "{service}/reset", m.ResetRequest, m.EstopReply,
