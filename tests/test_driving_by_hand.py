@@ -4,10 +4,10 @@ runs into nothing, and that a can is picked up by hand."""
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from math import hypot
+from math import atan2, cos, hypot, sin
 
 import pytest
-from robot_rig import HALTED_MPS, RobotRig
+from robot_rig import HALTED_MPS, RobotRig, yaw_of
 
 from cocoro import topics
 from cocoro.driving import Driving
@@ -51,6 +51,17 @@ async def at_rest_after(rig: RobotRig, since_s: float) -> float:
 def _speed(a: topics.m.Truth, b: topics.m.Truth) -> float:
     way_m = hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1])
     return way_m / ((b.stamp_ns - a.stamp_ns) / 1e9)
+
+
+def about_arm(rig: RobotRig, place_m: tuple[float, float, float]) -> tuple[float, float]:
+    """Distance, m, and azimuth, rad, of a place in the world from the arm's axis, by the true pose of the body."""
+    truth = rig.truths[-1]
+    yaw_rad = yaw_of(truth)
+    x, y = place_m[0] - truth.body_m[0], place_m[1] - truth.body_m[1]
+    axis = rig.robot.chain("arm_base").position({"arm_base": 0.0})
+    ahead = cos(yaw_rad) * x + sin(yaw_rad) * y - axis[0]
+    left = -sin(yaw_rad) * x + cos(yaw_rad) * y - axis[1]
+    return hypot(ahead, left), atan2(left, ahead)
 
 
 async def _stops_asking(rig: RobotRig, driving: Driving) -> None:
@@ -125,3 +136,42 @@ async def test_whoever_holds_the_way_ahead_does_not_run_into_the_can() -> None:
         left_m = hypot(x - body_m[0], y - body_m[1]) - 0.165 - 0.033
         assert 0.0 < left_m < 0.25
         assert rig.speed_mps < HALTED_MPS
+
+
+@in_virtual_time
+async def test_an_operator_picks_up_a_can_by_hand() -> None:
+    async with RobotRig() as rig:
+        plan = rig.operator.latest(topics.PLAN)
+        axis = rig.robot.chain("arm_base").position({"arm_base": 0.0})
+
+        def can() -> tuple[float, float]:
+            return about_arm(rig, rig.thing("red_can").position_m)
+
+        def hand() -> tuple[float, float, float]:
+            assert plan.value is not None
+            assert plan.value.hand_m is not None
+            x, y, z = plan.value.hand_m
+            return hypot(x - axis[0], y - axis[1]), atan2(y - axis[1], x - axis[0]), z
+
+        def unfolded() -> bool:
+            return hand()[0] > 0.35 and abs(hand()[1]) < 0.1
+
+        async with Driving(rig.operator, await rig.begin("drive")) as driving:
+            await hold(rig, driving, Motion(speed_mps=0.4), lambda: can()[0] < 0.7, 20.0)
+            await hold(rig, driving, Motion(speed_mps=0.06), lambda: can()[0] < 0.50, 20.0)
+            await hold(rig, driving, Motion(up_mps=0.001, grip="open"), unfolded, 10.0)
+            await rig.advance(1.0)
+            side = 1 if can()[1] > hand()[1] else -1
+            turn = Motion(round_radps=0.1 * side)
+            await hold(rig, driving, turn, lambda: side * (can()[1] - hand()[1]) < 0.0, 10.0)
+            await hold(rig, driving, Motion(up_mps=-0.1), lambda: hand()[2] < 0.07, 10.0)
+            await hold(rig, driving, Motion(out_mps=0.05), lambda: hand()[0] > can()[0] - 0.005, 10.0)
+            await hold(rig, driving, Motion(grip="close"), lambda: bool(plan.value and plan.value.holding), 4.0)
+            await hold(rig, driving, Motion(up_mps=0.1), lambda: hand()[2] > 0.15, 5.0)
+            await rig.advance(0.5)
+            assert rig.held("red_can")
+            assert rig.thing("red_can").position_m[2] > 0.1
+            height_m = rig.thing("red_can").position_m[2]
+            await hold(rig, driving, Motion(speed_mps=-0.05, turn_radps=0.3), lambda: False, 2.0)
+            assert rig.held("red_can")  # and it drives with it
+            assert rig.thing("red_can").position_m[2] == pytest.approx(height_m, abs=0.02)
