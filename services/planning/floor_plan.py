@@ -36,14 +36,13 @@ class FloorPlanner:
     """Makes the message when it is due."""
 
     def __init__(self) -> None:
-        self._made_ns: int | None = None
+        self._period: int | None = None
 
     def due(self, now_ns: int) -> bool:
-        """Whether a period has passed since the message before."""
-        if self._made_ns is not None and 0 <= now_ns - self._made_ns < _PERIOD_NS:
-            return False
-        self._made_ns = now_ns
-        return True
+        """Whether this is the first step, or the first one of a period. Periods are counted from the robot's time zero,
+        so that a planner that is executed again from the middle of a run makes them at the same steps."""
+        period, self._period = self._period, now_ns // _PERIOD_NS
+        return period != self._period
 
     @staticmethod
     def made(floor: FloorMap, way: Way | None) -> FloorPlan:
