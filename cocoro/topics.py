@@ -263,6 +263,11 @@ OBJECTS = Request(
     "The known objects, and where each was seen last.",
     right="see",
 )  # fmt: skip
+TASKS = Request(
+    "executive/tasks", m.TasksRequest, m.TasksReply,
+    "The tasks that can be asked for, each with its options.",
+    right="see",
+)  # fmt: skip
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch the emergency stop; answered by each service that moves something, and by the executive.",
@@ -308,5 +313,5 @@ STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
 REQUESTS: tuple[Request[Any, Any], ...] = (
-    RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
+    RUN, CANCEL, REPORT, OBJECTS, TASKS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
 )  # fmt: skip

@@ -22,7 +22,8 @@ from services.cockpit.access_door import Connection, Door
 from services.cockpit.access_limits import Audit, Budgets, Clock, Rate
 from services.cockpit.access_login import CODE_FIELD, login_page, style
 from services.cockpit.access_people import SESSION_S, People
-from services.cockpit.access_rules import Doing, Refusal, Role, Scope
+from services.cockpit.access_rules import Doing as Doing
+from services.cockpit.access_rules import Refusal, Role, Scope
 
 Message = dict[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -38,7 +39,7 @@ class Visitor(NamedTuple):
 
     name: str
     role: Role
-    key: str
+    key: str = ""
     """Of his budgets and log lines: this machine's user, his session or his certificate."""
 
 
