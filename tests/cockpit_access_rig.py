@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import socket
-import ssl
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import uvicorn
-
-from services.cockpit.access import App, Gate, GateLimits, Message, Receive, Send, Visitor
+from services.cockpit import server
+from services.cockpit.access import App, Certificates, Gate, GateLimits, Message, Receive, Send, Visitor
 from services.cockpit.access_door import Connection, Door, DoorLimits
 from services.cockpit.access_limits import Audit
 from services.cockpit.access_people import People
-from services.cockpit.access_rules import Scope
-from services.cockpit.access_serving import HEAD_BYTES, DoorServer
+from services.cockpit.access_rules import LOOPBACK_NAMES, Scope
+from services.cockpit.access_tls import Entrance
 
 HOST = "127.0.0.1:8770"
 ADDRESS = ("127.0.0.1", 50000)
@@ -105,7 +101,9 @@ def head(
         "type": kind, "scheme": scheme, "path": path.partition("?")[0], "raw_path": path.partition("?")[0].encode(),
         "query_string": path.partition("?")[2].encode(), "headers": rows, "client": client, "http_version": "1.1",
     }  # fmt: skip
-    return found if kind == "websocket" else found | {"method": method}
+    if kind == "http":
+        found["method"] = method
+    return found
 
 
 async def ask(app: App, scope: Scope, body: bytes = b"") -> Answer:
@@ -172,52 +170,21 @@ class Open(NamedTuple):
 
 @asynccontextmanager
 async def served(
+    entrance: Entrance | None = None,
     *,
-    context: ssl.SSLContext | None = None,
     people: People | None = None,
+    certificates: Certificates | None = None,
     door_limits: DoorLimits | None = None,
     gate_limits: GateLimits | None = None,
-    local_only: bool = True,
-    **given: Any,
 ) -> AsyncIterator[Open]:
     """The small application behind gate and door, at a free port of 127.0.0.1."""
+    entrance = entrance or Entrance("127.0.0.1", False, LOOPBACK_NAMES)
     audit, echo = Heard(asyncio.get_running_loop().time), Echo()
-    gate = Gate(tls=context is not None, people=people, limits=gate_limits, audit=audit, **given)
-    listener = socket.create_server(("127.0.0.1", 0))
-    listener.listen(128)
-    config = uvicorn.Config(
-        gate.app(echo), loop="none", http="h11", ws="websockets-sansio", lifespan="off", log_config=None,
-        access_log=False, proxy_headers=False, server_header=False, date_header=False, interface="asgi3",
-        ws_max_size=64 * 1024, ws_per_message_deflate=False, h11_max_incomplete_event_size=HEAD_BYTES,
+    gate = Gate(
+        names=entrance.names, tls=entrance.served is not None, people=people, certificates=certificates,
+        limits=gate_limits, audit=audit, door_limits=door_limits,
     )  # fmt: skip
-    config.load()
-
-    def open_door(protocols: Any) -> Door:
-        gate.door = Door(listener, protocols, context=context, local_only=local_only, limits=door_limits, audit=audit)
-        return gate.door
-
-    server = DoorServer(config, open_door)
-    server.lifespan = config.lifespan_class(config)
-    await server.startup()
-    assert gate.door is not None
-    try:
-        yield Open(listener.getsockname()[1], gate, gate.door, echo, audit)
-    finally:
-        for connection in list(gate.door.connections.values()):
-            connection.abort()
-        await server.shutdown()
-        listener.close()
-
-
-def certificate_for(site: Path, *names: str) -> None:
-    """Makes a site's authority and credentials in `site`, for names as 'operator ada' or 'robot body'."""
-    from datetime import UTC, datetime
-
-    from deploy.site import authority
-
-    now = datetime.now(UTC)
-    authority.init(site, now)
-    for each in names:
-        role, name = each.split()
-        addresses = ("127.0.0.1", "localhost") if role == "robot" else ()
-        authority.issue(site, role, name, now, addresses=addresses)  # type: ignore[arg-type]
+    listening = server.listen("127.0.0.1", 0)
+    async with server.serving(echo, gate, listening, entrance):
+        assert gate.door is not None
+        yield Open(listening.getsockname()[1], gate, gate.door, echo, audit)

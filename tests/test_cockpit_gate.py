@@ -7,7 +7,7 @@ from cockpit_access_rig import HOST, Answer, Echo, Fixed, Heard, ask, head, spea
 
 from cocoro.testing import in_virtual_time
 from services.cockpit import access_rules as rules
-from services.cockpit.access import GateLimits, Visitor
+from services.cockpit.access import GateLimits, Message, Visitor
 from services.cockpit.access_limits import Rate
 
 OWN = ("Origin", f"http://{HOST}")
@@ -184,11 +184,11 @@ async def test_a_body_that_does_not_come_is_not_waited_for() -> None:
 
     rig, sent = Rig(), []
 
-    async def never() -> dict[str, object]:
+    async def never() -> Message:
         await asyncio.sleep(1e6)
         return {}
 
-    async def send(message: dict[str, object]) -> None:
+    async def send(message: Message) -> None:
         sent.append(message)
 
     await rig.app(head("POST", "/captures/clean", [OWN, JSON, ("Content-Length", "9")]), never, send)
@@ -273,14 +273,14 @@ async def test_one_address_does_not_use_up_anothers_budget() -> None:
 
 @in_virtual_time
 async def test_messages_that_are_too_many_too_long_or_no_text_end_their_socket() -> None:
-    wrong = {
+    wrong: dict[int, list[Message | str]] = {
         1008: ["x"] * 300,
         1009: ["x" * (64 * 1024 + 1)],
         1003: [{"type": "websocket.receive", "bytes": b"\0\1"}],
     }
     for code, messages in wrong.items():
         rig = Rig()
-        spoken = await speak(rig.app, head(path="/live", headers=[OWN], scheme="ws"), [*messages, "after"])  # type: ignore[list-item]
+        spoken = await speak(rig.app, head(path="/live", headers=[OWN], scheme="ws"), [*messages, "after"])
         assert spoken.code == code
         assert rig.audit.has(spoken.reason)
         assert "after" not in rig.echo.messages
@@ -311,18 +311,18 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 
     rig, over = Rig(GateLimits(sockets=2)), asyncio.Event()
 
-    async def waiting() -> dict[str, object]:
+    async def waiting() -> Message:
         await over.wait()
         return {"type": "websocket.disconnect", "code": 1000}
 
-    async def send(_message: dict[str, object]) -> None: ...
+    async def send(_message: Message) -> None: ...
 
     scope = head(path="/live", headers=[OWN], scheme="ws")
 
     async def hold() -> None:
         first = True
 
-        async def receive() -> dict[str, object]:
+        async def receive() -> Message:
             nonlocal first
             if first:
                 first = False
@@ -350,7 +350,7 @@ async def test_a_socket_ends_with_its_visitors_session() -> None:
     app = rig.gate.app(rig.echo)
 
     async def hurrying(scope, receive, send):  # type: ignore[no-untyped-def]
-        async def later() -> dict[str, object]:
+        async def later() -> Message:
             message = await receive()
             if message.get("text") == "end":
                 rig.gate.visitor, rig.now_s = None, rig.now_s + 2.0

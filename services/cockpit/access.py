@@ -11,21 +11,21 @@ from __future__ import annotations
 
 import pwd
 import time
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, MutableMapping
 from contextlib import suppress
 from http import cookies
 from typing import Any, NamedTuple
 
 from cocoro.errors import CocoroError, RefusedError
 from services.cockpit import access_rules as rules
-from services.cockpit.access_door import Connection, Door
+from services.cockpit.access_door import Connection, Door, DoorLimits
 from services.cockpit.access_limits import Audit, Budgets, Clock, Rate
 from services.cockpit.access_login import CODE_FIELD, login_page, style
 from services.cockpit.access_people import SESSION_S, People
 from services.cockpit.access_rules import Doing as Doing
 from services.cockpit.access_rules import Refusal, Role, Scope
 
-Message = dict[str, Any]
+Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
@@ -85,6 +85,7 @@ class Gate:
         people: People | None = None,
         certificates: Certificates | None = None,
         limits: GateLimits | None = None,
+        door_limits: DoorLimits | None = None,
         audit: Audit | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
@@ -93,6 +94,7 @@ class Gate:
         self.tls = tls
         self.audit = audit or Audit(clock)
         self.limits = limits or GateLimits()
+        self.door_limits = door_limits or DoorLimits()
         self.door: Door | None = None
         """Set when it is open."""
         self.clock = clock

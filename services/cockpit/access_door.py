@@ -56,6 +56,7 @@ PIECE = 4096
 SWEEP_S = 0.5
 HANDSHAKE_S = 5.0
 BACKLOG = 128
+OTHERS, GONE = "another user's process", "its process has gone"
 FOREIGN = (
     b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Type: text/plain; charset=utf-8\r\n\r\n"
     b"This cockpit is another user's of this machine. `cocoro stop` is for everybody.\n"
@@ -225,7 +226,7 @@ class Door:
         self.sockets = (listener,)
         self.connections: dict[Address, Connection] = {}
         self.audit = audit or Audit()
-        self._listener, self._protocols, self._context, self._local_only = listener, protocols, context, local_only
+        self._listener, self._protocols, self.context, self._local_only = listener, protocols, context, local_only
         self.limits = limits or DoorLimits()
         self._peers = peers or Peers()
         clock = self.loop.time
@@ -242,7 +243,7 @@ class Door:
     def start(self) -> None:
         self._listener.listen(BACKLOG)
         self._open = True
-        self._take_more()
+        self.take_newcomers()
         self._timer = self.loop.call_later(SWEEP_S, self._sweep)
 
     def close(self) -> None:
@@ -260,14 +261,17 @@ class Door:
 
     # --- newcomers --------------------------------------------------------------------------------
 
-    def _take_more(self) -> None:
+    def take_newcomers(self) -> None:
         if self._open:
             self.loop.add_reader(self._listener.fileno(), self._on_newcomers)
 
-    def _shut(self, for_s: float) -> None:
-        """Leaves newcomers to the kernel for a moment."""
+    def hold_newcomers(self) -> None:
+        """Leaves newcomers to the kernel, until `take_newcomers`."""
         self.loop.remove_reader(self._listener.fileno())
-        self.loop.call_later(for_s, self._take_more)
+
+    def _shut(self, for_s: float) -> None:
+        self.hold_newcomers()
+        self.loop.call_later(for_s, self.take_newcomers)
 
     def _on_newcomers(self) -> None:
         for _ in range(AT_ONCE):
@@ -293,17 +297,16 @@ class Door:
             if found in (0, os.geteuid()):
                 user = found
             elif self._local_only:
-                why = "another user's process"
+                why = GONE if found is None else OTHERS
         if not why:
             why = self._no_room(key)
         if why:
             self.audit.refused(f"{address[0]}, {key}" if key != address[0] else key, f"connection: {why}")
-            with suppress(OSError):
+            with taken, suppress(OSError):
                 taken.setblocking(False)
-                if why == "another user's process" and self._context is None:
+                if why == OTHERS and self.context is None:
                     taken.send(FOREIGN)
                     taken.shutdown(socket.SHUT_WR)
-                taken.close()
             return False
         taken.setblocking(False)
         with suppress(OSError):
@@ -321,7 +324,7 @@ class Door:
             return "too many in a second"
         if not self._takes_all.take(""):
             return "too many in a second, of all"
-        if self._context is not None and len(self._shaking) >= self.limits.handshakes:
+        if self.context is not None and len(self._shaking) >= self.limits.handshakes:
             return "too many handshakes"
         mine = [each for each in self.connections.values() if each.key == key]
         if len(mine) >= self.limits.each and not self._make_room(mine):
@@ -344,10 +347,10 @@ class Door:
         return True
 
     async def _connect(self, taken: socket.socket, connection: Connection) -> None:
-        seconds = HANDSHAKE_S if self._context is not None else None
+        seconds = HANDSHAKE_S if self.context is not None else None
         try:
             await self.loop.connect_accepted_socket(
-                lambda: connection, taken, ssl=self._context, ssl_handshake_timeout=seconds
+                lambda: connection, taken, ssl=self.context, ssl_handshake_timeout=seconds
             )
         except (OSError, asyncio.CancelledError) as error:  # of which ssl.SSLError is one
             self.left(connection)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 TOO_LONG, NO_TEXT, TOO_MANY, ENDED = 1009, 1003, 1008, 4401
 """Codes with which a socket is closed; the last is the cockpit's own: the visitor's session has ended."""
+MALFORMED = (1002, 1007, 1009)
+"""Codes with which the server has closed a socket by itself."""
 STARTS = ("http.response.start", "websocket.http.response.start")
 STOP_MOST = 256
 """A longer message is no STOP."""
@@ -132,6 +134,8 @@ class _Socket:
             return {"type": "websocket.disconnect", "code": TOO_MANY}
         message = await self._receive()
         if message["type"] != "websocket.receive":
+            if message.get("code") in MALFORMED:
+                self._gate.audit.refused(f"{self._visitor.name}, {self._visitor.key}", "socket: malformed")
             return message
         text = message.get("text")
         if not self._messages.take(self._gate.clock()):

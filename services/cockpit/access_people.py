@@ -176,7 +176,7 @@ class People:
         return found
 
     def _must_have_room(self, place: str, most: int, advice: str) -> None:
-        if len([*self._rows(place)]) >= most:
+        if len(self._keys(place)) >= most and len([*self._rows(place)]) >= most:
             what = "codes are open" if place == INVITED else "sessions are open"
             raise RefusedError(f"{most} {what} already: {advice}")
 

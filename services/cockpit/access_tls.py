@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from cocoro.errors import ConfigError
-from services.cockpit.access_people import People, folder_of
 from services.cockpit.access_rules import LOOPBACK_NAMES, host_name
 
 TABLE = "[service.cockpit]"
@@ -52,6 +51,12 @@ class Served(NamedTuple):
     names: frozenset[str]
     """Host names and addresses that it is for, in small letters."""
 
+    def stamp(self) -> tuple[int, ...]:
+        """What changes when the files are replaced. Raises OSError."""
+        return tuple(
+            number for path in (self.cert, self.key) for number in (path.stat().st_mtime_ns, path.stat().st_ino)
+        )
+
 
 class Entrance(NamedTuple):
     """How the cockpit is reached."""
@@ -64,6 +69,14 @@ class Entrance(NamedTuple):
     served: Served | None = None
     ca: Path | None = None
     """The authority of clients' certificates."""
+
+    def url(self, port: int) -> str:
+        """Where a person opens the page."""
+        scheme = "http" if self.served is None else "https"
+        host = self.host
+        if ipaddress.ip_address(host).is_unspecified and self.served is not None:
+            host = min(self.served.names - LOOPBACK_NAMES, default="127.0.0.1")
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
     def context(self) -> ssl.SSLContext | None:
         """TLS for the listener; None without. Raises ConfigError."""
@@ -114,11 +127,6 @@ def entrance(settings: Settings, now: datetime | None = None) -> Entrance:
     found = Entrance(host, beyond, frozenset(own | served.names), served, folder / CA if settings.site else None)
     found.context()
     return found
-
-
-def people_of(robot: str) -> People:
-    """The codes and sessions of a robot."""
-    return People(folder_of(robot))
 
 
 def _host(text: str) -> str:
