@@ -186,6 +186,10 @@ PLAN = Topic(
     "What the planner does, and the reason. Beyond its age the running task fails.",
     shown=True,
 )  # fmt: skip
+FLOOR_PLAN = Topic(
+    "planning/map", m.FloorPlan, Qos.STATE, 2.0, 3.0,
+    "The floor as the planner knows it, and the way that it drives, for who looks on. Older ones are shown as old.",
+)  # fmt: skip
 HAND_SAMPLES = Topic(
     "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,
     "One sample of the arm's babbling: joint angles, and the position of the hand's marker at that time.",
@@ -241,7 +245,7 @@ RECORDING = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, OBSTACLES, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
+    DETECTIONS, OBSTACLES, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
     HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
 )  # fmt: skip
 

@@ -64,6 +64,7 @@ from cocoro.messages.node import (
 )
 from cocoro.messages.perception import Detection, Detections, Obstacles
 from cocoro.messages.planning import (
+    FloorPlan,
     HandSample,
     Intent,
     LearnedModel,
@@ -98,6 +99,7 @@ __all__ = [
     "FiniteQuaternion",
     "FiniteVec2",
     "FiniteVec3",
+    "FloorPlan",
     "Frame",
     "HandSample",
     "Health",

@@ -392,7 +392,7 @@ def _foreign_key(component: Component) -> str:
 def _check_shares(site: Site, robot: str, profile: Profile, hosts: Mapping[str, HostRow]) -> None:
     for process in profile.processes:
         on = [name for name, host in hosts.items() if process in host.processes]
-        if len(on) != 1:
+        if len(on) != 1 and not (named(process).optional and not on):
             there = f"on {' and on '.join(on)}" if on else "on no host"
             raise ConfigError(f"[robot.{robot}]: process {process} runs {there}; give it to one host's processes")
     if len(hosts) > 1:

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
 
+from cocoro import private
 from cocoro.messages import Frame, Message
 from cocoro.node import Node
-from cocoro.topics import Topic
+from cocoro.topics import ANY, RECORDING, Topic
 from services.cockpit.access import Visitor
 from services.cockpit.asking import Asker
 from services.cockpit.config import CockpitConfig
 from services.cockpit.feed import Feed
+from services.cockpit.log_lines import FIRST_LINES, LogLines
 from services.cockpit.outbox import Kind, Outbox
 from services.cockpit.pictures import Looking, Pictures, Viewing, levels
 from services.cockpit.scene import Scene, encoded
+from services.cockpit.shelf import Shelf
 from services.cockpit.stopping import Stopper
 
+T = TypeVar("T")
+
 STATE_HZ = 10.0
+LOG_S = 0.3
+"""Period in which the log is looked at for new lines."""
+WRITTEN_S = 0.3
+"""Longest wait for a recorder to tell what it writes."""
 
 
 class Viewer:
@@ -47,6 +60,10 @@ class Cockpit:
         self.stopper = Stopper(node, lambda told: self.tell_all("stopped", told))
         self.asker = Asker(node)
         self.pictures = Pictures(config.fps, self._marks, self._now_ns, threaded=not node.clock.virtual)
+        self.shelf = Shelf(None if config.folder is None else Path(config.folder))
+        self._log = LogLines(*private.log_folder(node.robot_name, private.default_run_dir() / node.robot_name))
+        self._recent: deque[dict[str, Any]] = deque(maxlen=FIRST_LINES)
+        self._disk = None if node.clock.virtual else ThreadPoolExecutor(2, "disk")
         self._feed = Feed(node, self._take, self._take_frame)
         self._looked_at = asyncio.Event()
         node.watch_alive(self._on_alive)
@@ -107,6 +124,37 @@ class Cockpit:
     def _now_ns(self) -> int:
         return self.node.clock.latest_ns() or 0
 
+    # --- the disk ---------------------------------------------------------------------------------
+
+    async def beside(self, work: Callable[[], T]) -> T:
+        """Work that waits for the disk, in a thread of its own; in virtual time, which knows no threads, here."""
+        if self._disk is None:
+            return work()
+        return await asyncio.get_running_loop().run_in_executor(self._disk, work)
+
+    async def written(self) -> list[str]:
+        """The captures that recorders write now."""
+        told = await self.node.newest(RECORDING.of(ANY), WRITTEN_S)
+        return [recording.file for recording in told if recording.file and not recording.ended]
+
+    def want_log(self, viewer: Viewer, on: bool) -> None:
+        """Send a viewer the newest lines of the log and those to come, or no more."""
+        if on and not viewer.log:
+            viewer.outbox.log(self._recent)
+        viewer.log = on
+
+    async def tell_log(self) -> None:
+        """Send new lines of the log to those who want them, for ever."""
+        while True:
+            await self._looked_at.wait()
+            wanting = [viewer for viewer in self.viewers if viewer.log]
+            lines = await self.beside(self._log.take) if wanting else []
+            self._recent.extend(lines)
+            if lines:
+                for viewer in wanting:
+                    viewer.outbox.log(lines)
+            await asyncio.sleep(LOG_S)
+
     # --- telling ----------------------------------------------------------------------------------
 
     def hello(self, viewer: Viewer) -> dict[str, Any]:
@@ -135,6 +183,7 @@ class Cockpit:
 
     async def run(self) -> None:
         """Tell the state to all viewers, for ever."""
+        self.node.spawn(self.tell_log())
         while True:
             await self._looked_at.wait()
             self.tell_all("state", self.scene.state(self._now_ns()))

@@ -25,6 +25,7 @@ COCKPIT = Component(
     doc="Shows the robot on a page in the browser, and takes stops and tasks from it.",
     reads=(FRAME, BASE_STATE, ARM_STATE, DETECTIONS, PLAN, TASK, LATCH, HEALTH, RECORDING),
     calls=(RUN, CANCEL, OBJECTS, TASKS, ESTOP, RESET),
+    optional=True,
     frames="reads",
     cpu_share=0.2,
     rss_mb=120.0,

@@ -7,7 +7,6 @@ from collections.abc import Coroutine
 from contextlib import suppress
 from typing import Any
 
-import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from services.cockpit.access import Gate, Visitor
@@ -30,13 +29,10 @@ from services.cockpit.orders import (
 )
 from services.cockpit.pointing import what
 from services.cockpit.scene import encoded
+from services.cockpit.socket_talk import reply_text, spoken, stop_reply
 
 AT_ONCE = 8
 """Requests of one viewer that may be under way."""
-MALFORMED = 1008
-"""The code with which a connection is closed that sent what is no message."""
-REASON_BYTES = 120
-"""A closing frame's reason takes 123 bytes at most."""
 
 
 class LiveSocket:
@@ -57,26 +53,13 @@ class LiveSocket:
         viewer = self._viewer = self._cockpit.enter(self._visitor)
         sending = asyncio.ensure_future(self._send(viewer))
         try:
-            while (order := await self._next()) is not None:
+            while (order := await spoken(self._socket, self._decoder)) is not None:
                 self._obey(order, viewer)
         finally:
             self._cockpit.leave(viewer)
             for task in (sending, *self._asking):
                 task.cancel()
             await asyncio.gather(sending, *self._asking, return_exceptions=True)
-
-    async def _next(self) -> LiveOrder | None:
-        """The page's next message; None at the end of the connection."""
-        message = await self._socket.receive()
-        if message["type"] != "websocket.receive":
-            return None
-        try:
-            return self._decoder.decode(message.get("text") or message.get("bytes") or b"")
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            reason = f"not a message of the protocol: {error}".encode()[:REASON_BYTES].decode(errors="ignore")
-            with suppress(RuntimeError, WebSocketDisconnect):
-                await self._socket.close(MALFORMED, reason)
-            return None
 
     async def _send(self, viewer: Viewer) -> None:
         await self._cockpit.asker.learn()
@@ -105,7 +88,7 @@ class LiveSocket:
             viewer.looking.on = order.on
             self._cockpit.attend()
         elif isinstance(order, Log):
-            viewer.log = order.on
+            self._cockpit.want_log(viewer, order.on)
         elif len(self._asking) >= AT_ONCE:
             self._refuse(order, viewer, f"{AT_ONCE} requests of this page are still under way: wait for an answer")
         else:
@@ -126,28 +109,12 @@ class LiveSocket:
             reply = await asker.reset(self._visitor.name)
         else:
             reply = what(order, self._cockpit.scene)
-        _reply(viewer, order.id, reply)
+        viewer.outbox.reply(reply_text(order.id, reply))
 
     async def _answer_stop(self, order: Stop, stopping: asyncio.Task[dict[str, Any]], viewer: Viewer) -> None:
-        told = await asyncio.shield(stopping)
-        stopped = bool(told["acknowledged"]) and not told["missing"]
-        _reply(viewer, order.id, Reply(stopped, stop_text(told), told))
+        viewer.outbox.reply(stop_reply(order.id, await asyncio.shield(stopping)))
 
     def _refuse(self, order: Order, viewer: Viewer, text: str) -> None:
         id: Id | None = getattr(order, "id", None)
         if id is not None:
-            _reply(viewer, id, Reply(False, text))
-
-
-def _reply(viewer: Viewer, id: Id, reply: Reply) -> None:
-    message = {"kind": "reply", "id": id, "ok": reply.ok, "text": reply.text}
-    viewer.outbox.reply(encoded(message | ({"data": reply.data} if reply.data is not None else {})))
-
-
-def stop_text(told: dict[str, Any]) -> str:
-    """The end of a stop as a sentence."""
-    acknowledged = ", ".join(told["acknowledged"])
-    text = f"stopped: {acknowledged}" if acknowledged else "nothing has acknowledged the stop"
-    if told["missing"]:
-        text += f"; NOT ACKNOWLEDGED by {', '.join(told['missing'])}"
-    return f"{text}; {told['trouble']}" if told["trouble"] else text
+            viewer.outbox.reply(reply_text(id, Reply(False, text)))

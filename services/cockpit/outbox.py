@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Callable
-from typing import Literal
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any, Literal
 
-Kind = Literal["stopped", "hello", "tick", "played", "state", "map", "log", "picture"]
-ORDER: tuple[Kind, ...] = ("stopped", "hello", "tick", "played", "state", "map", "log", "picture")
+from services.cockpit.scene import encoded
+
+Kind = Literal["stopped", "hello", "tick", "played", "state", "map", "picture"]
+ORDER: tuple[Kind, ...] = ("stopped", "hello", "tick", "played", "state", "map", "picture")
 """What is sent first."""
 REPLIES = 64
 """Answers that may wait; they are as many as a viewer asks at once."""
+
+LINES = 500
+"""Lines of the log that may wait; beyond it the oldest are left out."""
 
 
 class Outbox:
@@ -20,6 +25,7 @@ class Outbox:
     def __init__(self) -> None:
         self._newest: dict[Kind, str | bytes] = {}
         self._replies: deque[str] = deque(maxlen=REPLIES)
+        self._lines: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._changed = asyncio.Event()
 
     def put(self, kind: Kind, message: str | bytes) -> None:
@@ -30,6 +36,11 @@ class Outbox:
     def reply(self, message: str) -> None:
         """Send an answer."""
         self._replies.append(message)
+        self._changed.set()
+
+    def log(self, lines: Iterable[dict[str, Any]]) -> None:
+        """Send lines of the log, all of them together."""
+        self._lines.extend(lines)
         self._changed.set()
 
     async def run(self, send: Callable[[str | bytes], Awaitable[None]]) -> None:
@@ -48,4 +59,8 @@ class Outbox:
         for kind in ORDER:
             if kind in self._newest:
                 return self._newest.pop(kind)
+        if self._lines:
+            lines = list(self._lines)
+            self._lines.clear()
+            return encoded({"kind": "log", "lines": lines})
         return None

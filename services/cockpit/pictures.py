@@ -111,9 +111,9 @@ class Pictures:
         self.encoded = 0
         """Pictures that were encoded, for whomever."""
 
-    def take(self, frame: Frame, viewers: Iterable[Viewing]) -> asyncio.Future[None] | None:
-        """Encode a frame for those of the viewers that may get one now, if it is due."""
-        if self._busy or not self._due(frame.stamp_ns):
+    def take(self, frame: Frame, viewers: Iterable[Viewing], *, at_once: bool = False) -> asyncio.Future[None] | None:
+        """Encode a frame for those of the viewers that may get one now, if it is due, or `at_once`."""
+        if self._busy or not (at_once or self._due(frame.stamp_ns)):
             return None
         now_s = asyncio.get_running_loop().time()
         wanting = [viewer for viewer in viewers if viewer.looking.wants(now_s)]

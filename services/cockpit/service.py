@@ -23,6 +23,7 @@ async def run(node: Node, config: CockpitConfig) -> None:
     except ConfigError as error:
         node.log.error("%s", error)
         node.degraded(str(error))
+        node.report_health()
         await asyncio.get_running_loop().create_future()
         return
     url = entrance.url(listening.getsockname()[1])
@@ -31,6 +32,7 @@ async def run(node: Node, config: CockpitConfig) -> None:
         if config.port and f":{config.port}/" not in url:
             node.log.warning("port %d is taken: the page is at %s", config.port, url)
         node.ready(url)
+        node.report_health()  # `cocoro up` says the address
         await cockpit.run()
 
 
