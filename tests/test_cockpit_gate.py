@@ -7,8 +7,9 @@ from cockpit_access_rig import HOST, Answer, Echo, Fixed, Heard, ask, head, spea
 
 from cocoro.testing import in_virtual_time
 from services.cockpit import access_rules as rules
-from services.cockpit.access import GateLimits, Message, Visitor
+from services.cockpit.access import GateLimits, Message, Receive, Send, Visitor
 from services.cockpit.access_limits import Rate
+from services.cockpit.access_rules import Scope
 
 OWN = ("Origin", f"http://{HOST}")
 JSON = ("Content-Type", "application/json")
@@ -344,12 +345,9 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 async def test_a_socket_ends_with_its_visitors_session() -> None:
     rig = Rig(visitor=VIEWER)
 
-    def ended() -> list[str]:
-        return ["hello"]
-
     app = rig.gate.app(rig.echo)
 
-    async def hurrying(scope, receive, send):  # type: ignore[no-untyped-def]
+    async def hurrying(scope: Scope, receive: Receive, send: Send) -> None:
         async def later() -> Message:
             message = await receive()
             if message.get("text") == "end":
@@ -358,7 +356,7 @@ async def test_a_socket_ends_with_its_visitors_session() -> None:
 
         await app(scope, later, send)
 
-    spoken = await speak(hurrying, head(path="/live", headers=[OWN], scheme="ws"), [*ended(), "end", "after"])
+    spoken = await speak(hurrying, head(path="/live", headers=[OWN], scheme="ws"), ["hello", "end", "after"])
     assert spoken.code == 4401
     assert rig.echo.messages == ["hello"]
 

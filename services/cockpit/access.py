@@ -193,7 +193,7 @@ class Gate:
         return refusal
 
     def _is_stop(self, scope: Scope) -> bool:
-        return scope["type"] == "http" and scope["method"] == "POST" and scope["path"] == "/stop"
+        return (scope["type"], scope.get("method"), scope["path"]) == ("http", "POST", "/stop")
 
     # --- logging in and out -----------------------------------------------------------------------
 
