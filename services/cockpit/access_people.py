@@ -2,6 +2,7 @@
 
     <run>/<robot>/cockpit/invited/<hash of a code>     role, name, until when
                           sessions/<hash of a token>   role, name, until when, from where
+                          address                      the URL under which others open the page
 
 A code or a token itself is nowhere: who reads the folder cannot log in with what he finds. A code is taken by removing
 its file, which succeeds once. `cocoro cockpit` writes and lists these files, the cockpit reads them; a session whose
@@ -41,6 +42,8 @@ TOKEN_BYTES = 32
 FILE_BYTES = 4096
 NAME_MOST = 32
 INVITED, SESSIONS = "invited", "sessions"
+ADDRESS, ADDRESS_BYTES = "address", 1024
+"""File with the URL under which the page is served."""
 _HASH_DIGITS = 64
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
@@ -174,6 +177,16 @@ class People:
                 if key.startswith(row.key):
                     self._remove(place, key)
         return found
+
+    def serves(self, url: str | None) -> None:
+        """Tells `cocoro cockpit` where others open the page; None: nowhere. Where that cannot be written, the cockpit
+        works all the same."""
+        with suppress(FileNotFoundError, ConfigError):
+            if url is not None:
+                private.write(self.folder / ADDRESS, url.encode())
+                return
+            with private.directory(self.folder) as fd:
+                os.unlink(ADDRESS, dir_fd=fd)
 
     def _must_have_room(self, place: str, most: int, advice: str) -> None:
         if len(self._keys(place)) >= most and len([*self._rows(place)]) >= most:

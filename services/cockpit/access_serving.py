@@ -19,7 +19,7 @@ from cocoro.errors import ConfigError
 from services.cockpit.access import Certificates, Gate
 from services.cockpit.access_certificates import SiteCertificates
 from services.cockpit.access_door import Door, Protocols
-from services.cockpit.access_people import People, folder_of
+from services.cockpit.access_people import People
 from services.cockpit.access_tls import Entrance
 
 log = logging.getLogger("cocoro.cockpit.access")
@@ -30,10 +30,9 @@ RENEWED_S = 60.0
 """Time between two looks for a certificate that was renewed."""
 
 
-def gate_of(entrance: Entrance, robot: str, site: str = "") -> Gate:
+def gate_of(entrance: Entrance, robot: str, people: People, site: str = "") -> Gate:
     """The gate of a robot's cockpit; `site` is the folder of the site whose persons have certificates."""
     certificates = SiteCertificates(Path(site), robot, complain=log.error) if site else Certificates()
-    people = People(folder_of(robot)) if entrance.served is not None else None
     return Gate(names=entrance.names, tls=entrance.served is not None, people=people, certificates=certificates)
 
 
