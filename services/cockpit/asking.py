@@ -23,6 +23,8 @@ from cocoro.topics import CANCEL, OBJECTS, RESET, RUN, TASKS
 
 LEARN_S = 1.0
 """Longest wait for the executive's tasks and objects."""
+INSTEAD_S = 6.0
+"""Longest wait for a task that begins when another has come to rest."""
 EXECUTIVE = "executive"
 
 
@@ -69,13 +71,14 @@ class Asker:
         ]
         self._learnt = True
 
-    async def run(self, task: Mapping[str, Any]) -> Reply:
-        """Start a task."""
-        return await self._told(self._node.call(RUN, TaskRequest(task=dict(task))))
+    async def run(self, task: Mapping[str, Any], *, instead: bool = False) -> Reply:
+        """Start a task; `instead` of the one that runs, once the robot is at rest."""
+        request = TaskRequest(task=dict(task), instead=instead)
+        return await self._told(self._node.call(RUN, request, INSTEAD_S if instead else None))
 
-    async def cancel(self) -> Reply:
-        """End the running task."""
-        return await self._told(self._node.call(CANCEL, CancelRequest()))
+    async def cancel(self, task_id: str = "") -> Reply:
+        """End the running task, or this one."""
+        return await self._told(self._node.call(CANCEL, CancelRequest(task_id=task_id)))
 
     async def _told(self, asking: Any) -> Reply:
         try:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cocoro import private
-from cocoro.messages import Frame, Message
+from cocoro.messages import FloorPlan, Frame, Message
 from cocoro.node import Node
 from cocoro.topics import ANY, RECORDING, Topic
 from services.cockpit.access import Visitor
@@ -27,6 +27,7 @@ from services.cockpit.stopping import Stopper
 T = TypeVar("T")
 
 STATE_HZ = 10.0
+SHOWN_OF_FLOOR = ("cells", "way_m", "goal_m", "origin_m", "width", "height", "cell_m")
 LOG_S = 0.3
 """Period in which the log is looked at for new lines."""
 WRITTEN_S = 0.3
@@ -65,6 +66,7 @@ class Cockpit:
         self._recent: deque[dict[str, Any]] = deque(maxlen=FIRST_LINES)
         self._disk = None if node.clock.virtual else ThreadPoolExecutor(2, "disk")
         self._feed = Feed(node, self._take, self._take_frame)
+        self._told_floor: FloorPlan | None = None
         self._looked_at = asyncio.Event()
         node.watch_alive(self._on_alive)
 
@@ -75,6 +77,8 @@ class Cockpit:
         viewer = Viewer(Looking(self.levels), visitor)
         self.viewers.add(viewer)
         self.attend()
+        if (floor := self.scene.map()) is not None:
+            viewer.outbox.put("map", encoded(floor))
         return viewer
 
     def leave(self, viewer: Viewer) -> None:
@@ -100,6 +104,15 @@ class Cockpit:
 
     def _take(self, topic: Topic[Any], message: Message) -> None:
         self.scene.take(topic, message)
+        if isinstance(message, FloorPlan) and not self._told(message):
+            self._told_floor = message
+            if (floor := self.scene.map()) is not None:
+                self.tell_all("map", floor)
+
+    def _told(self, floor: FloorPlan) -> bool:
+        """Whether the viewers have this map already."""
+        told = self._told_floor
+        return told is not None and all(getattr(told, name) == getattr(floor, name) for name in SHOWN_OF_FLOOR)
 
     def _take_frame(self, frame: Frame) -> None:
         self.pictures.take(frame, [viewer.viewing for viewer in self.viewers])

@@ -12,9 +12,13 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from services.cockpit.access import Gate, Visitor
 from services.cockpit.asking import Reply
 from services.cockpit.cockpit import Cockpit, Viewer
+from services.cockpit.driver import Driver
 from services.cockpit.orders import (
     RIGHTS,
+    BeginDrive,
     Cancel,
+    Drive,
+    EndDrive,
     Id,
     LiveOrder,
     Log,
@@ -44,19 +48,21 @@ class LiveSocket:
         self._gate = gate
         self._visitor = visitor
         self._decoder = live_decoder()
-        self._viewer: Viewer | None = None
         self._asking: set[asyncio.Task[None]] = set()
+        self._driver: Driver
 
     async def run(self) -> None:
         """Serve the page until one of both ends the connection."""
         await self._socket.accept()
-        viewer = self._viewer = self._cockpit.enter(self._visitor)
+        viewer = self._cockpit.enter(self._visitor)
+        self._driver = Driver(self._cockpit, viewer)
         sending = asyncio.ensure_future(self._send(viewer))
         try:
             while (order := await spoken(self._socket, self._decoder)) is not None:
                 self._obey(order, viewer)
         finally:
             self._cockpit.leave(viewer)
+            self._driver.close()
             for task in (sending, *self._asking):
                 task.cancel()
             await asyncio.gather(sending, *self._asking, return_exceptions=True)
@@ -84,6 +90,8 @@ class LiveSocket:
             self._refuse(order, viewer, "you may look and stop, and not operate: ask for the role of an operator")
         elif isinstance(order, Seen):
             viewer.looking.seen(order.stamp_ns, asyncio.get_running_loop().time())
+        elif isinstance(order, Drive):
+            self._driver.move(order)
         elif isinstance(order, Look):
             viewer.looking.on = order.on
             self._cockpit.attend()
@@ -99,14 +107,18 @@ class LiveSocket:
         self._asking.add(task)
         task.add_done_callback(self._asking.discard)
 
-    async def _answer(self, order: Run | Cancel | Reset | What, viewer: Viewer) -> None:
+    async def _answer(self, order: Run | Cancel | Reset | What | BeginDrive | EndDrive, viewer: Viewer) -> None:
         asker = self._cockpit.asker
         if isinstance(order, Run):
-            reply = await asker.run(order.task)
+            reply = await asker.run(order.task, instead=order.instead)
         elif isinstance(order, Cancel):
             reply = await asker.cancel()
         elif isinstance(order, Reset):
             reply = await asker.reset(self._visitor.name)
+        elif isinstance(order, BeginDrive):
+            reply = await self._driver.begin(instead=order.instead)
+        elif isinstance(order, EndDrive):
+            reply = await self._driver.end()
         else:
             reply = what(order, self._cockpit.scene)
         viewer.outbox.reply(reply_text(order.id, reply))

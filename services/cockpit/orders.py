@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages import FiniteVec2
+from cocoro.messages import Count, FiniteVec2, Motion
 from services.cockpit.access import Doing
 
 Id = int | Annotated[str, Meta(max_length=64)]
@@ -65,6 +65,27 @@ class What(Order, frozen=True, kw_only=True, tag="what"):
     map: FiniteVec2 | None = None
 
 
+class BeginDrive(Order, frozen=True, kw_only=True, tag="begin-drive"):
+    """Take the robot, to drive it by hand."""
+
+    id: Id
+    instead: bool = False
+    """End the running task for it."""
+
+
+class Drive(Order, frozen=True, kw_only=True, tag="drive"):
+    """The motion that is wanted now; it counts only with a tick that is fresh on the robot."""
+
+    tick: Count = 0
+    motion: Motion = Motion()
+
+
+class EndDrive(Order, frozen=True, kw_only=True, tag="end-drive"):
+    """Let go of the robot."""
+
+    id: Id
+
+
 class Seen(Order, frozen=True, kw_only=True, tag="seen"):
     """A picture was shown."""
 
@@ -101,13 +122,14 @@ class Speed(Order, frozen=True, kw_only=True, tag="speed"):
     x: Annotated[float, Meta(ge=0.1, le=16)]
 
 
-LiveOrder = Run | Cancel | Stop | Reset | What | Seen | Log | Look
+LiveOrder = Run | Cancel | Stop | Reset | What | BeginDrive | Drive | EndDrive | Seen | Log | Look
 PlayOrder = Stop | What | Seen | Look | Seek | Pause | Speed
 
-RIGHTS: dict[type[Order], Doing] = {Run: "operate", Cancel: "operate", Reset: "operate", Stop: "stop"}
+RIGHTS: dict[type[Order], Doing] = {
+    Stop: "stop",
+    **dict.fromkeys((Run, Cancel, Reset, BeginDrive, Drive, EndDrive), "operate"),
+}
 """What an order needs; `look` where it is not listed."""
-
-Refusal = Literal["", "not allowed", "busy"]
 
 
 def live_decoder() -> msgspec.json.Decoder[LiveOrder]:

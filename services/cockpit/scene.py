@@ -7,6 +7,8 @@ scene.marks(stamp_ns)           # what is drawn into the picture of that stamp
 
 from __future__ import annotations
 
+import zlib
+from base64 import b64encode
 from collections.abc import Callable
 from math import hypot
 from typing import Any
@@ -19,6 +21,7 @@ from cocoro.messages import (
     BaseState,
     Detection,
     Detections,
+    FloorPlan,
     Health,
     Latch,
     Message,
@@ -35,12 +38,19 @@ SHOWN_S = 2.0
 """Age from which a state is told as old."""
 SEEN_S = 0.7
 """Age up to which detections are drawn into a newer picture."""
+WAY_S = 1.5
+"""Age up to which the planner's way is drawn into a picture."""
+WAY_STEPS = 64
+"""Places of the way that are drawn into a picture."""
+DRIVE_TASK = "drive"
+"""The task in which somebody drives by hand."""
 
 TOPICS: tuple[Topic[Any], ...] = (
     topics.BASE_STATE,
     topics.ARM_STATE,
     topics.DETECTIONS,
     topics.PLAN,
+    topics.FLOOR_PLAN,
     topics.TASK,
     topics.LATCH,
     topics.HEALTH,
@@ -63,11 +73,13 @@ class Scene:
         self.alive: set[str] = set()
         """Services that hold their token; in a capture nobody tells, so those that are heard count."""
         self.detections: Detections | None = None
+        self.floor: FloorPlan | None = None
         self._takers: dict[str, Callable[[Any], None]] = {
             topics.BASE_STATE.name: self._take_base,
             topics.ARM_STATE.name: self._take_arm,
             topics.DETECTIONS.name: self._take_detections,
             topics.PLAN.name: self._take_plan,
+            topics.FLOOR_PLAN.name: self._take_floor,
             topics.TASK.name: self._take_task,
             topics.LATCH.name: self._take_latch,
         }
@@ -100,6 +112,9 @@ class Scene:
         self.plan = plan
         self.sight.take_pose(plan)
 
+    def _take_floor(self, floor: FloorPlan) -> None:
+        self.floor = floor
+
     def _take_task(self, task: TaskState) -> None:
         self.task = task
 
@@ -120,21 +135,47 @@ class Scene:
             "recording": self._recording(now_ns),
             "services": self._services(now_ns),
             "hosts": [],
+            "drive": {"task_id": self.task.task_id} if self.drives else None,
+        }
+
+    @property
+    def drives(self) -> bool:
+        """Whether somebody drives by hand."""
+        return self.task.task == DRIVE_TASK and self.task.outcome is None
+
+    def map(self) -> dict[str, Any] | None:
+        """The floor map, as the page wants it; None before it was heard."""
+        floor = self.floor
+        if floor is None:
+            return None
+        return {
+            "kind": "map",
+            "cell_m": floor.cell_m,
+            "origin": floor.origin_m,
+            "width": floor.width,
+            "height": floor.height,
+            "cells": b64encode(zlib.compress(floor.cells, 1)).decode(),
+            "way": floor.way_m,
+            "goal": floor.goal_m,
         }
 
     def marks(self, stamp_ns: int, width: int, height: int) -> dict[str, Any]:
         """What is drawn into a picture of that stamp, in its pixels."""
         place = self.sight.at(stamp_ns)
-        hand = way = goal = None
+        hand = goal = None
+        way: list[tuple[float, float]] = []
         if self.plan is not None and place is not None:
             if self.plan.hand_m is not None:
                 hand = place.pixel_of_body(self.plan.hand_m, width, height)
             if self.plan.target is not None:
                 goal = place.pixel_of_floor(self.plan.target.odometry_position_m, width, height)
+            if self.floor is not None and stamp_ns - self.floor.stamp_ns < WAY_S * NS:
+                pixels = (place.pixel_of_floor((*step, 0.0), width, height) for step in self.floor.way_m[:WAY_STEPS])
+                way = [pixel for pixel in pixels if pixel is not None]
         return {
             "detections": self._detected(stamp_ns, width, height),
             "hand": hand,
-            "way": way or [],
+            "way": way,
             "goal": goal,
         }
 
