@@ -28,7 +28,7 @@ async def spoken(socket: WebSocket, decoder: msgspec.json.Decoder[M]) -> M | Non
         return None
     try:
         return decoder.decode(message.get("text") or message.get("bytes") or b"")
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         reason = f"not a message of the protocol: {error}".encode()[:REASON_BYTES].decode(errors="ignore")
         with suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(MALFORMED, reason)
