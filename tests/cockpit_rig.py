@@ -31,6 +31,7 @@ class Knows(Gate):
     """Lets in visitors of one role."""
 
     def __init__(self, role: Role | None) -> None:
+        super().__init__()
         self.role = role
 
     def who(self, scope: Mapping[str, Any]) -> Visitor | None:

@@ -32,4 +32,5 @@ COCKPIT = Component(
     cpu_share=0.2,
     rss_mb=120.0,
     libraries=("starlette", "uvicorn", "websockets", "opencv-python-headless"),
+    checks="services.cockpit.checks",
 )

@@ -19,3 +19,14 @@ class CockpitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Of the pictures for viewers whose network carries them; for others it is less."""
     folder: str | None = None
     """Folder of the captures, beside that of the recorder that is heard. Default: that of the recorder's default."""
+    names: tuple[str, ...] = ()
+    """Names and addresses under which other machines open the page, besides those of its certificate."""
+    credentials: str = ""
+    """Folder of `cocoro pki` with cert.pem, key.pem and ca.pem, for TLS."""
+    tls_cert: str = ""
+    """File of another certificate (PEM), with `tls_key`: of an authority that browsers know, say."""
+    tls_key: str = ""
+    """File of its private key (PEM), which nobody else may read."""
+    site: str = ""
+    """Folder of a site (site.toml, admitted.toml): its persons are let in by their certificates. Needs `credentials`,
+    whose ca.pem verifies them."""

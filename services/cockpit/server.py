@@ -7,16 +7,21 @@ compressed: pictures are compressed already, and the time counts.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from typing import Any
+from functools import partial
 
 import uvicorn
 
 from cocoro.errors import ConfigError
+from services.cockpit.access import App, Gate
+from services.cockpit.access_door import BACKLOG
+from services.cockpit.access_serving import HEAD_BYTES, DoorServer, keep_renewed, open_door
+from services.cockpit.access_tls import Entrance
 
 PORTS = 10
 """Ports that are tried, from the wanted one on."""
@@ -39,7 +44,7 @@ def listen(host: str, port: int) -> socket.socket:
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             found.bind((host, tried))
-            found.listen(64)
+            found.listen(BACKLOG)
         except OSError as error:
             found.close()
             if error.errno != errno.EADDRINUSE:
@@ -52,27 +57,31 @@ def listen(host: str, port: int) -> socket.socket:
     raise ConfigError(f"[service.cockpit] the ports {tries[0]} to {tries[-1]} of {host} are all taken: choose another")
 
 
-def address(listening: socket.socket, scheme: str = "http") -> str:
-    """The URL of the page."""
-    host, port = listening.getsockname()[:2]
-    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
-
-
 @asynccontextmanager
-async def serving(app: Any, listening: socket.socket, **options: Any) -> AsyncIterator[None]:
-    """Serve an ASGI application while the context lasts. `options` are uvicorn's, for TLS."""
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+async def serving(app: App, gate: Gate, listening: socket.socket, entrance: Entrance) -> AsyncIterator[None]:
+    """Serve an ASGI application behind a gate while the context lasts. Raises ConfigError."""
+    logging.getLogger("uvicorn").setLevel(logging.ERROR)  # door and gate log what is malformed, without a flood
+    logging.getLogger("uvicorn.error").addFilter(_of_ours)
     config = uvicorn.Config(
-        app, loop="none", http="h11", ws="websockets-sansio", lifespan="off", log_config=None, log_level="warning",
-        access_log=False, proxy_headers=False, server_header=False, date_header=False, interface="asgi3",
-        ws_max_size=MESSAGE_BYTES, ws_per_message_deflate=False, timeout_graceful_shutdown=ENDING_S, **options,
+        gate.app(app), loop="none", http="h11", ws="websockets-sansio", lifespan="off", log_config=None,
+        log_level="error", access_log=False, proxy_headers=False, server_header=False, date_header=False,
+        interface="asgi3", ws_max_size=MESSAGE_BYTES, ws_per_message_deflate=False,
+        h11_max_incomplete_event_size=HEAD_BYTES, timeout_graceful_shutdown=ENDING_S,
     )  # fmt: skip
     config.load()
-    server = uvicorn.Server(config)
+    server = DoorServer(config, partial(open_door, gate, listening, entrance))
     server.lifespan = config.lifespan_class(config)
     await server.startup(sockets=[listening])
+    context = gate.door.context if gate.door is not None else None
+    renewing = asyncio.ensure_future(keep_renewed(context, entrance))
     try:
         yield
     finally:
+        renewing.cancel()
         with suppress(OSError):
             await server.shutdown(sockets=[listening])
+
+
+def _of_ours(record: logging.LogRecord) -> bool:
+    """Whether a line of uvicorn's is of a fault here, and not of a client that sends rubbish."""
+    return "Invalid UTF-8" not in str(record.msg)
