@@ -11,13 +11,13 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
 import uvicorn
-from cockpit_world import OBJECTS, TASKS, World, captures
+from cockpit_world import HEIGHT, OBJECTS, TASKS, WIDTH, World, captures
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -33,6 +33,9 @@ POLICY = (
     " base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
 FPS = 12.0
+PATIENCE_S = 30.0
+LINE = {"level": "info", "service": "planning", "text": "drives around the box"}
+LINES: list[dict[str, Any]] = [{}, {"level": "warning", "service": "perception", "text": "a frame was late: 140 ms"}]
 GONE = (WebSocketDisconnect, RuntimeError)
 """What sending to a page raises that is closed."""
 PLAYED_S = 31.5
@@ -88,29 +91,26 @@ class Viewer:
 
     async def take(self, message: dict[str, Any]) -> None:
         do, world = message["do"], self.fake.world
-        self.fake.asked.append(message)
+        self.fake.note(message)
         if do == "seen":
             self.seen.set()
         elif do == "pictures":
             self.pictures = message["on"]
         elif do == "drive":
             if self.fake.answers:
-                await self.send("tick", tick=world.drive(message["tick"], message["motion"]))
+                await self.send("tick", **world.drive(message["tick"], message["motion"]))
         elif do == "stop":
             await self.fake.stop()
-        elif do == "log":
-            if message["on"]:
-                lines = [
-                    ("info", "planning", "drives around the box"),
-                    ("warning", "perception", "a frame was late: 140 ms"),
-                ]
-                told = [{"t_ns": time.time_ns(), "level": level, "service": who, "text": text} for level, who, text in lines * 6]  # fmt: skip
-                await self.send("log", lines=told)
+        elif do == "log" and message["on"]:
+            await self.send("log", lines=[LINE | {"t_ns": time.time_ns(), **line} for line in LINES * 6])
         elif do in ("seek", "pause", "speed"):
-            self.played |= {"seek": {"at_s": message.get("at_s")}, "pause": {"paused": message.get("on")}, "speed": {"speed": message.get("x")}}[do]  # fmt: skip
+            name, value = {"seek": ("at_s", "at_s"), "pause": ("paused", "on"), "speed": ("speed", "x")}[do]
+            self.played[name] = message[value]
             await self.send("played", **self.played, marks=MARKS)
         elif "id" in message:
             await self.send("reply", id=message["id"], **self.fake.answer(message))
+            if do == "begin-drive" and world.drives:
+                await self.send("tick", **world.drive(0, {}))
 
     async def _states(self) -> None:
         while True:
@@ -132,8 +132,10 @@ class Viewer:
             if self.pictures and self.fake.sees:
                 self.seen.clear()
                 stamp_ns = time.time_ns()
+                self.fake.stamps.append(stamp_ns)
                 marks, jpeg = self.fake.world.picture()
-                header = {"stamp_ns": stamp_ns, "now_ns": time.time_ns(), "width": 640, "height": 480, "level": 0, "marks": marks}  # fmt: skip
+                header = {"stamp_ns": stamp_ns, "now_ns": time.time_ns(), "width": WIDTH, "height": HEIGHT}
+                header |= {"level": "1/80", "marks": marks}
                 text = json.dumps(header).encode()
                 await self.socket.send_bytes(struct.pack("<I", len(text)) + text + jpeg)
             await asyncio.sleep(1 / FPS)
@@ -146,14 +148,17 @@ class FakeCockpit:
         self.world = World()
         self.role = role
         self.asked: list[dict[str, Any]] = []
-        """All messages of all pages, in their order."""
-        self.posted: list[tuple[str, str]] = []
-        """Method and path of the requests that change something."""
+        """All messages of all pages, in their order; a request that changes something is one, too."""
+        self.stamps: list[int] = []
+        """Of the pictures that went out."""
+        self.stops = True
+        """Whether a stop is acknowledged."""
         self.sees = True
         """Whether pictures come."""
         self.answers = True
         """Whether motions are answered."""
         self._viewers: set[Viewer] = set()
+        self._news = threading.Condition()
         routes = [
             Route("/", self._page),
             Mount("/static", StaticFiles(directory=PAGE)),
@@ -164,7 +169,9 @@ class FakeCockpit:
             WebSocketRoute("/play", self._play),
         ]
         app = Starlette(routes=routes, middleware=[Middleware(Strict)])
-        config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="error", ws="websockets-sansio", lifespan="off")
+        config = uvicorn.Config(
+            app, host="127.0.0.1", port=port, log_level="error", ws="websockets-sansio", lifespan="off"
+        )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
 
@@ -175,6 +182,10 @@ class FakeCockpit:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the server, as a service does that is killed."""
         self._server.should_exit = self._server.force_exit = True
         self._thread.join()
 
@@ -183,13 +194,32 @@ class FakeCockpit:
         host, port = self._server.servers[0].sockets[0].getsockname()[:2]
         return f"http://{host}:{port}/"
 
+    def note(self, message: dict[str, Any]) -> None:
+        """A page has sent this."""
+        with self._news:
+            self.asked.append(message)
+            self._news.notify_all()
+
+    def until(self, met: Callable[[], object]) -> None:
+        """Wait until that is so; it is looked at whenever a page sends something."""
+        with self._news:
+            assert self._news.wait_for(met, PATIENCE_S), f"not within {PATIENCE_S:g} s; last: {self.asked[-5:]}"
+
     def done(self, do: str) -> list[dict[str, Any]]:
         """The messages of that kind that pages have sent."""
         return [message for message in list(self.asked) if message["do"] == do]
 
     def hello(self, *, live: bool) -> dict[str, Any]:
-        limits = {"speed_mps": 0.35, "turn_radps": 1.5}
-        return {"robot": "calliope", "role": self.role, "live": live, "tasks": TASKS, "objects": OBJECTS, "body": {"radius_m": 0.17}, "limits": limits, "fps": FPS}  # fmt: skip
+        return {
+            "robot": "calliope",
+            "role": self.role,
+            "live": live,
+            "tasks": TASKS,
+            "objects": OBJECTS,
+            "body": {"radius_m": 0.17},
+            "limits": {"speed_mps": 0.35, "turn_radps": 1.5},
+            "fps": FPS,
+        }
 
     def answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """The reply to a request of a page."""
@@ -204,7 +234,6 @@ class FakeCockpit:
             case "begin-drive":
                 ok, text = world.begin({"task": "drive"}, message["instead"])
                 world.drives = ok
-                data = {"tick": world.new_tick()} if ok else None
             case "end-drive":
                 world.end("done")
             case "what":
@@ -224,6 +253,8 @@ class FakeCockpit:
         return {"label": None, "place": [1.0, 0.2], "text": "1.0 m away"}
 
     async def stop(self) -> dict[str, Any]:
+        if not self.stops:
+            return {"acknowledged": [], "missing": [], "ms": 0.0}
         self.world.latch = "latched"
         self.world.end("cancelled", "cancelled: the robot was stopped")
         answer = {"acknowledged": ["base", "servos", "executive"], "missing": [], "ms": 4.2}
@@ -236,15 +267,15 @@ class FakeCockpit:
         return FileResponse(PAGE / "index.html")
 
     async def _stop(self, request: Request) -> Response:
-        self.posted.append((request.method, request.url.path))
+        self.note({"do": "posted", "path": request.url.path})
         return JSONResponse(await self.stop())
 
     async def _captures(self, _: Request) -> Response:
         return JSONResponse({"captures": captures()})
 
     async def _change(self, request: Request) -> Response:
-        self.posted.append((request.method, request.url.path))
-        return JSONResponse({"ok": True, "text": ""})
+        self.note({"do": request.method.lower(), "path": request.url.path})
+        return JSONResponse({"ok": True})
 
     async def _live(self, socket: WebSocket) -> None:
         await self._serve(Viewer(self, socket))

@@ -18,30 +18,43 @@ from cocoro.clock import NS
 WIDTH, HEIGHT, FOCAL_PX, CAMERA_M, TILT_RAD = 640, 480, 525.0, 0.62, 0.42
 HOLD_S = 0.2
 CELL_M = 0.05
-OBJECTS = [
-    {"label": "red_can", "shape": "cylinder", "graspable": True},
-    {"label": "green_can", "shape": "cylinder", "graspable": True},
-    {"label": "blue_can", "shape": "cylinder", "graspable": True},
-    {"label": "yellow_ball", "shape": "sphere", "graspable": True},
-    {"label": "hand_marker", "shape": "box", "graspable": False},
-]
+WHY = {
+    "approach": "drives around the box on its right",
+    "drive": "driven by hand",
+    "search": "looks for it on the left",
+}
+SHAPES = {"red_can": "cylinder", "green_can": "cylinder", "blue_can": "cylinder", "yellow_ball": "sphere"}
+OBJECTS = [{"label": label, "shape": shape, "graspable": True} for label, shape in SHAPES.items()]
+OBJECTS += [{"label": "hand_marker", "shape": "box", "graspable": False}]
 PLACES_M = {"red_can": (1.9, 0.25), "green_can": (2.3, -0.5), "blue_can": (-0.6, 1.4)}
-COLOURS = {"red_can": (212, 42, 38), "green_can": (30, 150, 60), "blue_can": (40, 70, 200)}
-FLAG = {"name": "bring", "type": "bool", "default": False, "description": "Bring it to where the task began.", "min": None, "max": None}  # fmt: skip
-SPAN = {"name": "for_s", "type": "float", "default": None, "description": "Follow for so long.", "min": 0, "max": 3600}
-FAR = {"name": "distance_m", "type": "float", "default": 0.2, "description": "From the robot's centre to the object's nearest edge.", "min": 0, "max": 5}  # fmt: skip
-PLACE = [{"name": name, "type": "float", "default": None, "description": "", "min": None, "max": None} for name in ("x_m", "y_m")]  # fmt: skip
+COLOURS = {"red_can": (38, 42, 212), "green_can": (60, 150, 30), "blue_can": (200, 70, 40)}
+"""Blue, green, red."""
+
+
+def _option(name: str, kind: str = "float", **more: Any) -> dict[str, Any]:
+    return {"name": name, "type": kind, "default": None, "needed": False, "description": ""} | more
+
+
+def _task(name: str, label: str, doc: str, *options: dict[str, Any]) -> dict[str, Any]:
+    return {"name": name, "label": label, "doc": doc, "options": options}
+
+
 TASKS = [
-    {"name": "babble-arm", "label": "", "doc": "Move the arm about and look at the hand.", "options": []},
-    {"name": "drive", "label": "", "doc": "Drive by hand.", "options": []},
-    {"name": "fetch", "label": "graspable", "doc": "Find an object, drive there, grasp it and lift it.", "options": [FLAG]},
-    {"name": "follow", "label": "known", "doc": "Keep behind an object that moves.", "options": [SPAN]},
-    {"name": "go-there", "label": "", "doc": "Drive to a place.", "options": PLACE},
-    {"name": "go-to", "label": "known", "doc": "Drive to an object and stop before it.", "options": [FAR]},
-    {"name": "park", "label": "", "doc": "Fold the arm.", "options": []},
-    {"name": "put-down", "label": "", "doc": "Set down what the hand holds.", "options": []},
-    {"name": "touch", "label": "graspable", "doc": "Bring the open hand around something.", "options": []},
-]  # fmt: skip
+    _task("drive", "", "Drive by hand."),
+    _task(
+        "fetch",
+        "graspable",
+        "Find an object, drive there, grasp it and lift it.",
+        _option("bring", "bool", default=False, description="Bring it to where the task began and put it down."),
+    ),
+    _task("follow", "known", "Keep behind it.", _option("for_s", min=0, max=3600, description="Follow for so long.")),
+    _task("go-there", "", "Drive to a place.", _option("x_m", needed=True), _option("y_m", needed=True)),
+    _task("go-to", "known", "Drive to it.", _option("distance_m", default=0.2, description="Distance to its edge, m.")),
+    _task("park", "", "Fold the arm."),
+    _task("put-down", "", "Set down what the hand holds: here, or at a place.", _option("x_m"), _option("y_m")),
+    _task("touch", "graspable", "Bring the open hand around something."),
+    _task("wave", "", "Somebody else's task."),
+]
 
 
 @dataclass
@@ -65,7 +78,6 @@ class World:
     def __post_init__(self) -> None:
         self._ids = itertools.count(1)
         self._last_s = time.monotonic()
-        self._step_count = 0
 
     def begin(self, task: dict[str, Any], instead: bool) -> tuple[bool, str]:
         """Begin a task, or say why not."""
@@ -76,10 +88,19 @@ class World:
         self.drives = False
         first = "search" if task.get("label") else task["task"]
         self.task = {
-            "task": task["task"], "label": task.get("label", ""), "phase": first, "text": "", "outcome": None, "reason": "",
-            "task_id": f"task-{next(self._ids)}", "elapsed_s": 0.0, "phases": [{"name": first}], "distance_m": None,
-            "began_s": time.monotonic(), "options": task,
-        }  # fmt: skip
+            "task": task["task"],
+            "label": task.get("label", ""),
+            "phase": first,
+            "text": "",
+            "outcome": None,
+            "reason": "",
+            "task_id": f"task-{next(self._ids)}",
+            "elapsed_s": 0.0,
+            "phases": [{"name": first}],
+            "distance_m": None,
+            "began_s": time.monotonic(),
+            "options": task,
+        }
         return True, ""
 
     @property
@@ -97,20 +118,20 @@ class World:
         self.ticks_s[self.tick] = time.monotonic()
         return self.tick
 
-    def drive(self, tick: int, motion: dict[str, float]) -> int:
-        """Take a motion that quotes that tick; returns the next one."""
+    def drive(self, tick: int, motion: dict[str, float]) -> dict[str, Any]:
+        """Take a motion that quotes that tick; returns the next one, and whether the motion counts."""
         issued_s = self.ticks_s.get(tick, -1.0)
-        if self.drives and self.latch == "released" and time.monotonic() - issued_s <= HOLD_S:
+        counts = self.drives and self.latch == "released" and time.monotonic() - issued_s <= HOLD_S
+        if counts:
             self.moves_until_s = issued_s + HOLD_S
             self.speed_mps, self.turn_radps = motion.get("speed_mps", 0.0), motion.get("turn_radps", 0.0)
             self.driven.append(motion)
-        return self.new_tick()
+        return {"tick": self.new_tick(), "accepted": counts}
 
     def step(self) -> None:
         """Move on to now."""
         now_s = time.monotonic()
         passed_s, self._last_s = now_s - self._last_s, now_s
-        self._step_count += 1
         if self.running:
             self.task["elapsed_s"] = now_s - self.task["began_s"]
         if self.drives and now_s > self.moves_until_s:
@@ -170,16 +191,12 @@ class World:
         for line_m in np.arange(-6, 7, 0.5):
             for ends in (((line_m, -6), (line_m, 6)), ((-6, line_m), (6, line_m))):
                 self._line(image, *ends)
-        for label, (x_m, y_m) in PLACES_M.items():
-            for mark in self.seen():
-                if mark["label"] == label:
-                    left, top, right, bottom = mark["box"]
-                    colour = tuple(reversed(COLOURS[label]))
-                    shade = tuple(int(value * 0.7) for value in colour)
-                    cv2.rectangle(image, (left, top), (right, bottom), shade, -1)
-                    cv2.rectangle(image, (left, top), ((left + 2 * right) // 3, bottom), colour, -1)
-                    cv2.ellipse(image, ((left + right) // 2, top), ((right - left) // 2, 4), 0, 0, 360, colour, -1)
-            del x_m, y_m
+        for mark in self.seen():
+            left, top, right, bottom = mark["box"]
+            colour = COLOURS[mark["label"]]
+            cv2.rectangle(image, (left, top), (right, bottom), [value * 0.7 for value in colour], -1)
+            cv2.rectangle(image, (left, top), ((left + 2 * right) // 3, bottom), colour, -1)
+            cv2.ellipse(image, ((left + right) // 2, top), ((right - left) // 2, 4), 0, 0, 360, colour, -1)
         marks: dict[str, Any] = {"detections": self.seen(), "hand": None, "way": [], "goal": None}
         if (way := self.way()) and self.running:
             points = [self.pixel(x_m, y_m, 0.0) for x_m, y_m in way]
@@ -188,10 +205,14 @@ class World:
         return marks, cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
     def _line(self, image: Any, one_m: tuple[float, float], other_m: tuple[float, float]) -> None:
-        points = [self.pixel(one_m[0] + (other_m[0] - one_m[0]) * share, one_m[1] + (other_m[1] - one_m[1]) * share, 0.0) for share in np.linspace(0, 1, 33)]  # fmt: skip
+        ends = np.array([one_m, other_m])
+        points = [
+            self.pixel(x_m, y_m, 0.0) for x_m, y_m in ends[0] + np.linspace(0, 1, 33)[:, None] * (ends[1] - ends[0])
+        ]
         for start, end in itertools.pairwise(points):
             if start is not None and end is not None and max(map(abs, start + end)) < 4000:
-                cv2.line(image, (round(start[0]), round(start[1])), (round(end[0]), round(end[1])), (118, 124, 122), 1, cv2.LINE_AA)  # fmt: skip
+                first, last = (round(start[0]), round(start[1])), (round(end[0]), round(end[1]))
+                cv2.line(image, first, last, (118, 124, 122), 1, cv2.LINE_AA)
 
     def way(self) -> list[list[float]]:
         x_m, y_m = PLACES_M.get(self.task.get("label", ""), (0.0, 0.0))
@@ -225,40 +246,64 @@ class World:
     def plan(self) -> dict[str, Any]:
         seen = {mark["label"] for mark in self.seen()}
         known = [
-            {"label": label, "x": x_m, "y": y_m, "age_s": 0.05 if label in seen else 42.0, "sigma_m": 0.01 if label in seen else 0.12}
+            {"label": label, "x": x_m, "y": y_m, "age_s": 0.05, "sigma_m": 0.01}
+            if label in seen
+            else {"label": label, "x": x_m, "y": y_m, "age_s": 42.0, "sigma_m": 0.12}
             for label, (x_m, y_m) in PLACES_M.items()
-        ]  # fmt: skip
-        why = {"drive": "driven by hand", "approach": "drives around the box on its right", "search": "looks for it on the left"}
+        ]
         phase = self.task.get("phase", "idle") if self.running else "idle"
         return {
-            "behaviour": phase, "why": why.get(phase, "stands still: nothing to do"), "state": "running",
-            "body": [self.x_m, self.y_m, self.yaw_rad], "hand": [0.2, 0.0, 0.3], "holding": False, "known": known,
+            "behaviour": phase,
+            "why": WHY.get(phase, "stands still: nothing to do"),
+            "state": "running",
+            "body": [self.x_m, self.y_m, self.yaw_rad],
+            "hand": [0.2, 0.0, 0.3],
+            "holding": False,
+            "known": known,
             "target": self.task.get("label") or None,
-        }  # fmt: skip
+        }
 
     def state(self) -> dict[str, Any]:
         """The message `state`."""
         self.step()
-        names = ("base", "capture", "executive", "kinect", "perception", "planning", "servos")
-        services = [
-            {"service": name, "state": "ready", "text": "", "cpu": 0.03 + 0.05 * (index % 3), "rss_mb": 61.0 + 9 * index, "alive": True, "faults": [], "late": False}
-            for index, name in enumerate(names)
-        ]  # fmt: skip
         shown = {key: value for key, value in self.task.items() if key not in ("began_s", "options")}
         return {
-            "kind": "state", "now_ns": time.time_ns(), "task": shown or None, "plan": self.plan(),
-            "base": {"speed_mps": self.speed_mps, "turn_radps": self.turn_radps, "battery": 0.83, "charging": False, "bumped": [], "stopped_by": "" if self.latch == "released" else "estop"},
+            "kind": "state",
+            "now_ns": time.time_ns(),
+            "task": shown or None,
+            "plan": self.plan(),
+            "base": {
+                "speed_mps": self.speed_mps,
+                "turn_radps": self.turn_radps,
+                "battery": 0.83,
+                "charging": False,
+                "bumped": [],
+                "stopped_by": "" if self.latch == "released" else "estop",
+            },
             "latch": self.latch,
-            "recording": {"file": "robot.mcap", "size_bytes": 12_400_000 + 20_000 * self._step_count, "rate": 210_000.0, "occasion": "", "fault": "", "dropped": {}, "task_id": ""},
-            "services": services, "hosts": [],
-            "drive": {"task_id": self.task["task_id"], "tick": self.tick} if self.drives else None,
-        }  # fmt: skip
+            "recording": {"file": "robot.mcap", "size_bytes": 12_400_000, "fault": "", "dropped": 0},
+            "services": [
+                {
+                    "service": name,
+                    "state": "ready",
+                    "text": "",
+                    "cpu": 0.06,
+                    "rss_mb": 74.0,
+                    "alive": True,
+                    "faults": [],
+                }
+                for name in ("base", "capture", "executive", "kinect", "perception", "planning", "servos")
+            ],
+            "hosts": [],
+            "drive": {"task_id": self.task["task_id"]} if self.drives else None,
+        }
 
 
 def captures() -> list[dict[str, Any]]:
     """The answer to `GET /captures`."""
     began_ns = 1_796_000_000 * NS
     rows = [
+        ("", "", 12.0, 1_300_000, False),
         ("fetch red_can", "done", 31.5, 22_400_000, True),
         ("follow blue_ball", "cancelled", 62.0, 48_100_000, False),
         ("fetch green_can", "failed", 44.2, 31_000_000, False),
@@ -266,8 +311,15 @@ def captures() -> list[dict[str, Any]]:
     ]
     return [
         {
-            "name": f"latest-{index}", "file": f"/captures/calliope-{index}.mcap", "size_bytes": size, "pinned": pinned, "closed": True, "robot": "calliope",
-            "began_ns": began_ns - index * 5400 * NS, "duration_s": duration_s, "messages": 9000, "what": what, "task_id": "", "outcome": outcome, "reason": "",
+            "name": f"calliope-20261128-{index:02}",
+            "size_bytes": size,
+            "pinned": pinned,
+            "closed": True,
+            "began_ns": began_ns - index * 5400 * NS,
+            "duration_s": duration_s,
+            "what": what,
+            "outcome": outcome,
+            "written": index == 0,
         }
         for index, (what, outcome, duration_s, size, pinned) in enumerate(rows)
-    ]  # fmt: skip
+    ]

@@ -34,7 +34,7 @@ export class Captures {
   render() {
     const panel = the("captures");
     const head = panel.querySelector("header");
-    const list = this.captures ?? [];
+    const list = (this.captures ?? []).filter((capture) => !capture.gone);
     const items = list.map((capture) => this.#item(capture));
     const none = this.captures === null ? say("captures.loading") : say("captures.none");
     const parts = [items.length ? make("ul", { class: "shelf" }, ...items) : make("p", { class: "soft" }, none)];
@@ -48,11 +48,11 @@ export class Captures {
       capture.began_ns ? moment(capture.began_ns / 1e9) : "",
       capture.duration_s ? span(capture.duration_s) : "",
       bytes(capture.size_bytes ?? 0),
-      capture.closed === false ? say("captures.open") : "",
+      capture.written ? say("captures.written") : capture.closed === false ? say("captures.open") : "",
     ];
     const how = capture.outcome ? { done: "good", failed: "bad" }[capture.outcome] ?? "warn" : null;
     const outcome = capture.outcome ? make("span", { class: how }, ` — ${say(`outcome.${capture.outcome}`)}`) : "";
-    const path = `/captures/${encodeURIComponent(nameOf(capture))}`;
+    const path = `/captures/${encodeURIComponent(capture.name)}`;
     const doing = [
       this.#button("watch", what, () => this.onWatch(capture)),
       make("a", { class: "round", href: `${path}/file`, download: true, "aria-label": say("captures.download", { what }) }, drawing(...LINES.download)),
@@ -61,7 +61,7 @@ export class Captures {
       const pin = this.#button("pin", what, () => this.#change("POST", `${path}/${capture.pinned ? "unpin" : "pin"}`));
       pin.setAttribute("aria-pressed", String(Boolean(capture.pinned)));
       doing.push(pin);
-      if (!capture.pinned && capture.closed !== false) doing.push(this.#button("remove", what, (event) => this.#sure(event.currentTarget, path, what)));
+      if (!capture.pinned && !capture.written) doing.push(this.#button("remove", what, (event) => this.#sure(event.currentTarget, path, what)));
     }
     return make("li", {}, make("span", { class: "what" }, what, outcome), make("span", { class: "facts" }, facts.filter(Boolean).join(" · ")), make("span", { class: "doing" }, ...doing));
   }
@@ -96,17 +96,12 @@ export class Captures {
   async #change(method, path, body) {
     try {
       const answer = await request(method, path, body);
-      if (answer?.text) notice(answer.text);
+      if (answer?.deleted) notice(say("captures.deleted", { count: answer.deleted.length }));
     } catch (error) {
       notice(error.message);
     }
     await this.open();
   }
-}
-
-/** The name by which the server knows a capture: that of its file. */
-export function nameOf(capture) {
-  return capture.file.split("/").at(-1);
 }
 
 /** What a capture shows, in words. */
@@ -118,7 +113,6 @@ export function describe(capture) {
 async function request(method, path, body) {
   const headers = { "X-Cockpit": "1", ...(body ? { "Content-Type": "application/json" } : {}) };
   const answer = await fetch(path, { method, headers, body: body ? JSON.stringify(body) : undefined, credentials: "same-origin" });
-  const content = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
-  if (!answer.ok) throw new Error(content?.text ?? content?.error ?? `${answer.status} ${answer.statusText}`);
-  return content;
+  if (!answer.ok) throw new Error((await answer.text()).trim() || `${answer.status} ${answer.statusText}`);
+  return answer.json();
 }

@@ -45,7 +45,7 @@ export class Drive {
 
   /** Take a message `hello`. */
   greet(hello) {
-    for (const name of Object.keys(this.hold.limits)) if (hello.limits?.[name]) this.hold.limits[name] = hello.limits[name];
+    this.hold.limit(hello.limits ?? {});
     this.mayDrive = hello.role === "operator";
     this.render();
   }
@@ -64,7 +64,6 @@ export class Drive {
     if (reply.ok) {
       this.driving = this.hold.allowed = true;
       this.begunMs = performance.now();
-      if (reply.data?.tick != null) this.hold.take(reply.data.tick);
       this.why = "";
       this.wake = await navigator.wakeLock?.request("screen").catch(() => null);
       announce(say("drive.begun"));
@@ -133,7 +132,7 @@ export class Drive {
   #tell() {
     const shown = the("drive-state");
     let [text, kind] = [say("drive.off"), "off"];
-    if (this.driving && this.hold.late) [text, kind] = [say("drive.late"), "bad"];
+    if (this.driving && this.hold.late) [text, kind] = [this.hold.refusal || say("drive.late"), "bad"];
     else if (this.driving && this.hold.moves) [text, kind] = [this.#speed(), "moves"];
     else if (this.driving) [text, kind] = [this.why ? say(`drive.let_go.${this.why}`) : say("drive.ready"), this.why ? "bad" : "ready"];
     else if (!this.mayDrive) text = say("do.viewer");

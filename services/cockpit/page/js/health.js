@@ -18,8 +18,7 @@ export function showHealth(state) {
 
 function level(one) {
   if (one.alive === false) return "bad";
-  if (one.faults?.length || (one.late && one.late.length !== 0)) return one.state === "ready" ? "warn" : "bad";
-  return one.state === "ready" ? "good" : "warn";
+  return one.state === "ready" && !one.faults?.length ? "good" : "warn";
 }
 
 function table(services, hosts) {
@@ -28,7 +27,7 @@ function table(services, hosts) {
     one.service,
     level(one),
     [one.alive === false ? say("health.dead") : one.state, one.text].filter(Boolean).join(": "),
-    [...(one.faults ?? []), ...(Array.isArray(one.late) ? one.late : one.late ? [say("health.late")] : [])],
+    one.faults ?? [],
     `${number((one.cpu ?? 0) * 100, 0)} %`,
     bytes((one.rss_mb ?? 0) * 1e6),
   ]);

@@ -5,11 +5,12 @@
 // the connection, or was frozen; it sends nothing while nothing is held.
 const PERIOD_MS = 40;
 const FROZEN_MS = 200;
-const UNANSWERED_MS = 400;
+const UNCOUNTED_MS = 400;
 const MOST_WAITING_BYTES = 1024;
 const STATE_TICK_MS = 300;
-const DEFAULTS = {
-  speed_mps: 0.3, turn_radps: 1.2, pan_radps: 0.8, tilt_radps: 0.6, out_mps: 0.08, round_radps: 0.5, up_mps: 0.08, roll_radps: 0.8,
+/** The most that a control asks for; a robot that can do less says so. */
+const MOST = {
+  speed_mps: 0.5, turn_radps: 1.6, pan_radps: 1.0, tilt_radps: 0.8, out_mps: 0.08, round_radps: 0.5, up_mps: 0.08, roll_radps: 0.8,
 }; // prettier-ignore
 
 export class Hold {
@@ -18,16 +19,18 @@ export class Hold {
     this.link = link;
     this.onChange = onChange;
     this.held = new Map();
-    this.limits = { ...DEFAULTS };
+    this.limits = { ...MOST };
     this.pace = 0.6;
     this.tick = 0;
     this.tickMs = -STATE_TICK_MS;
+    this.countedMs = 0;
+    this.refusal = "";
     this.beganMs = 0;
     this.beatMs = 0;
     this.timer = 0;
     this.late = false;
     this.allowed = false;
-    link.on("tick", (message) => this.take(message.tick));
+    link.on("tick", (message) => this.take(message));
     link.on("lost", () => this.letGo("lost"));
     document.addEventListener("visibilitychange", () => document.hidden && this.letGo("hidden"));
     document.addEventListener("freeze", () => this.letGo("hidden"));
@@ -35,10 +38,17 @@ export class Hold {
     document.addEventListener("stopping", () => this.letGo("stop"));
   }
 
-  /** A tick that came as an answer. */
-  take(tick) {
+  /** Take what the robot says it can do at most, by the names of a motion or of a joint of the neck. */
+  limit(limits) {
+    for (const name of Object.keys(MOST)) this.limits[name] = Math.min(MOST[name], limits[name] ?? limits[`neck_${name}`] ?? MOST[name]);
+  }
+
+  /** The answer to a motion: the next tick, and whether the motion counted. */
+  take({ tick, accepted = true, text = "" }) {
     this.tick = tick;
     this.tickMs = performance.now();
+    if (accepted) this.countedMs = this.tickMs;
+    this.refusal = accepted ? "" : text;
   }
 
   /** A tick in a message `state`, which may be older than one that came as an answer. */
@@ -112,7 +122,7 @@ export class Hold {
     else if (!this.link.isOpen) this.letGo("lost");
     if (!this.moves) return;
     if (this.link.waitingBytes < MOST_WAITING_BYTES) this.link.send({ do: "drive", tick: this.tick, motion: this.motion() });
-    const late = nowMs - Math.max(this.tickMs, this.beganMs) > UNANSWERED_MS;
+    const late = nowMs - Math.max(this.countedMs, this.beganMs) > UNCOUNTED_MS;
     if (late !== this.late) {
       this.late = late;
       this.onChange("late");

@@ -145,7 +145,7 @@ function battery(base) {
 
 function recording(state) {
   const button = the("open-captures");
-  const bad = Boolean(state?.fault) || Object.keys(state?.dropped ?? {}).length > 0;
+  const bad = Boolean(state?.fault) || state?.dropped > 0;
   mark(button.querySelector(".dot"), "data-state", !state ? "" : bad ? "warn" : state.file ? "good" : "");
   const text = !state ? say("captures.title") : state.fault ? say("captures.fault") : bytes(state.size_bytes ?? 0);
   write(button.querySelector(".value"), text);

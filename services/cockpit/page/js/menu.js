@@ -1,7 +1,7 @@
 // The menu of what can be done with "this" and "there", beside the place that was pointed at.
 import { make, the } from "./dom.js";
 import { accepted } from "./said.js";
-import { called, say } from "./words.js";
+import { called, metres, say } from "./words.js";
 
 export class Menu {
   /** `link`: where the question goes; `tasks`: the `Tasks` to choose from. */
@@ -34,12 +34,14 @@ export class Menu {
     if (found.label) {
       for (const task of this.tasks.with(found.label)) items.push(this.#item(task, { label: found.label }));
     }
-    if (found.place) {
+    if (found.place && !found.label) {
       const [x_m, y_m] = found.place;
       for (const task of this.tasks.atPlaces) items.push(this.#item(task, { x_m, y_m }));
     }
     const name = found.label ? called("object", found.label) : say(found.place ? "menu.there" : "menu.nothing");
-    this.box.replaceChildren(make("p", {}, name), found.text ? make("p", {}, found.text) : "", ...items);
+    const body = this.tasks.state.plan?.body;
+    const away = found.place && body ? say("menu.away", { away: metres(Math.hypot(found.place[0] - body[0], found.place[1] - body[1])) }) : "";
+    this.box.replaceChildren(make("p", {}, name), away ? make("p", {}, away) : "", ...items);
     this.box.setAttribute("aria-label", name);
     section.append(this.box);
     this.box.hidden = false;

@@ -1,6 +1,6 @@
 // Playing a capture: the same screen shows it, with a line of its time under the picture.
 import { make, mark, the, write } from "./dom.js";
-import { describe, nameOf } from "./captures.js";
+import { describe } from "./captures.js";
 import { Link } from "./link.js";
 import { notice } from "./said.js";
 import { number, say } from "./words.js";
@@ -31,7 +31,7 @@ export class Player {
   open(capture) {
     this.close();
     this.what = describe(capture);
-    const link = new Link(`/play?capture=${encodeURIComponent(nameOf(capture))}`, { returns: false });
+    const link = new Link(`/play?capture=${encodeURIComponent(capture.name)}`, { returns: false });
     this.link = link;
     link.on("played", (message) => this.#take(message));
     link.on("lost", ({ reason }) => {

@@ -25,12 +25,12 @@ export function connect(bySocket, say) {
 export function stop() {
   since = performance.now();
   tries = 0;
-  show("sent", words("stop.sent"));
-  document.dispatchEvent(new CustomEvent("stopping"));
-  navigator.vibrate?.(60);
   clearInterval(timer);
   timer = setInterval(again, AGAIN_MS);
   again();
+  show("sent", words("stop.sent"));
+  document.dispatchEvent(new CustomEvent("stopping"));
+  navigator.vibrate?.(60);
 }
 
 /** Take what the server tells of a stop, here or by anybody else. */
@@ -57,9 +57,13 @@ export function latch(isLatched) {
 function again() {
   tries += 1;
   if (tries > TRIES) clearInterval(timer);
-  send();
+  try {
+    send();
+  } catch (error) {
+    console.warn("the socket does not take STOP", error);
+  }
   fetch("/stop", { method: "POST", keepalive: true, credentials: "same-origin", headers: { "X-Cockpit": "1" } })
-    .then((answer) => (answer.ok ? answer.json() : null))
+    .then((answer) => answer.json())
     .then((answer) => answer && stopped(answer))
     .catch(() => {});
   if (performance.now() - since > ALARM_MS) show("bad", words("stop.nobody"));

@@ -7,6 +7,7 @@ import { called, metres, say, span } from "./words.js";
 const FIRST = ["fetch", "follow", "go-to", "touch", "put-down", "park"];
 const OWN_BUTTON = ["drive"];
 const MAIN = "fetch";
+const PLACE = ["x_m", "y_m"];
 const SEEN_S = 1.5;
 const UPDATE_MS = 400;
 
@@ -57,7 +58,7 @@ export class Tasks {
 
   /** Tasks that are done at a place. */
   get atPlaces() {
-    return this.tasks.filter((task) => !task.label && isPlace(task));
+    return this.tasks.filter((task) => !task.label && placeOf(task).length === PLACE.length);
   }
 
   /** Ask for a task. A robot that is busy is taken from its task only when the person says so. */
@@ -94,7 +95,7 @@ export class Tasks {
   #listed() {
     const rank = (task) => (FIRST.includes(task.name) ? FIRST.indexOf(task.name) : FIRST.length);
     const order = (one, other) => rank(one) - rank(other);
-    return this.tasks.filter((task) => !OWN_BUTTON.includes(task.name) && !isPlace(task)).sort(order);
+    return this.tasks.filter((task) => !OWN_BUTTON.includes(task.name) && !needsPlace(task)).sort(order);
   }
 
   #object(item) {
@@ -131,8 +132,9 @@ export class Tasks {
     const main = task.name === MAIN && task.label;
     const name = make("span", {}, called("task", task.name));
     const button = make("button", { type: "button", class: `task${main ? " first" : ""}`, onclick: begin }, name);
-    if (!task.options?.length) return button;
-    const open = () => this.#open(task);
+    const options = task.options.filter((option) => !PLACE.includes(option.name));
+    if (options.length === 0) return button;
+    const open = () => this.#open(task, options);
     const label = say("task.options", { task: called("task", task.name) });
     return make("div", { class: "pair" }, button, make("button", { type: "button", class: `task${main ? " first" : ""}`, "aria-label": label, onclick: open }, "⋯"));
   }
@@ -147,9 +149,9 @@ export class Tasks {
     return make("button", { type: "button", class: "task more", "aria-expanded": String(this.more), onclick: turn }, text);
   }
 
-  #open(task) {
+  #open(task, options) {
     const form = the("options");
-    const fields = task.options.map((option) => [option, field(option)]);
+    const fields = options.map((option) => [option, field(option)]);
     const object = task.label ? ` ${called("object", this.chosen)}` : "";
     const begin = (event) => {
       event.preventDefault();
@@ -182,9 +184,12 @@ export function title(task) {
   return [called("task", task.task), task.label ? called("object", task.label) : ""].filter(Boolean).join(" ");
 }
 
-function isPlace(task) {
-  const names = (task.options ?? []).map((option) => option.name);
-  return names.includes("x_m") && names.includes("y_m");
+function placeOf(task) {
+  return (task.options ?? []).filter((option) => PLACE.includes(option.name));
+}
+
+function needsPlace(task) {
+  return placeOf(task).some((option) => option.needed);
 }
 
 function isTruth(option) {
@@ -209,6 +214,7 @@ function field(option) {
     min: option.min ?? null,
     max: option.max ?? null,
     step: isText ? null : option.type === "int" ? "1" : "any",
+    required: Boolean(option.needed),
   });
 }
 
