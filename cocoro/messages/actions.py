@@ -99,6 +99,13 @@ class GoTo(Action, frozen=True, tag="go-to"):
     """From the body's centre to the object's, over the floor, at the end."""
 
 
+class GoThere(Action, frozen=True, tag="go-there"):
+    """Drive to a place on the floor, the arm folded."""
+
+    place_m: FiniteVec2
+    """Where the body's centre is to be at the end, odometry frame."""
+
+
 class BabbleArm(Action, frozen=True, tag="babble-arm"):
     """Move the arm from draw to draw and report where the hand is seen."""
 
@@ -127,8 +134,8 @@ def _brought() -> Iterator[type[Action]]:
 ACTIONS: Registry[Action] = Registry(
     "action",
     (
-        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, BabbleArm,
-        BabbleWheels,
+        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, GoThere,
+        BabbleArm, BabbleWheels,
     ),
     _brought,
 )  # fmt: skip

@@ -7,11 +7,12 @@ from services.executive.tasks.arm import ParkTask, PutDownTask
 from services.executive.tasks.babble import BabbleArmTask, BabbleWheelsTask
 from services.executive.tasks.fetch import FetchTask
 from services.executive.tasks.follow import FollowTask
+from services.executive.tasks.go_there import GoThereTask
 from services.executive.tasks.go_to import GoToTask
 from services.executive.tasks.touch import TouchTask
 
 TASKS = registry(
-    (FetchTask, FollowTask, TouchTask, GoToTask, ParkTask, PutDownTask, BabbleArmTask, BabbleWheelsTask)
+    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, BabbleArmTask, BabbleWheelsTask)
 )  # fmt: skip
 """All tasks by name, third parties' included."""
 
@@ -21,6 +22,7 @@ __all__ = [
     "BabbleWheelsTask",
     "FetchTask",
     "FollowTask",
+    "GoThereTask",
     "GoToTask",
     "ParkTask",
     "PutDownTask",
