@@ -18,7 +18,8 @@ from cocoro.node import Node
 from cocoro.task_table import described
 from cocoro.testing import ServiceUnderTest
 from cocoro.topics import OBJECTS, TASKS
-from services.cockpit.access import Gate, Role, Visitor
+from services.cockpit.access import Gate, Visitor
+from services.cockpit.access_rules import Role
 from services.cockpit.app import App
 from services.cockpit.cockpit import Cockpit
 from services.cockpit.config import CockpitConfig
