@@ -32,6 +32,9 @@ TURN_RADPS = 2.0
 BOUND_MS = 60.0
 RESTS_MPS = 0.01
 RESTS_MS = 300.0
+TURNS_MPS = 0.05
+"""Speed of a wheel from which the robot turns."""
+WATCH_NS = 2_000_000_000
 PATIENCE_S = 20.0
 
 
@@ -65,6 +68,8 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
                 viewer.wait()
         time.sleep(0.5)
         zero, rest = _by_the_truth(motion, sent_ns)
+    if not zero:
+        raise CocoroError("the robot stood before each stop: this machine is too busy")
     report.value("from the click to the first acknowledgement on the page", told, "ms")
     report.value("from the click to zero commanded", zero, "ms", at_most=BOUND_MS)
     report.value("from the click to rest", rest, "ms", at_most=RESTS_MS)
@@ -133,12 +138,15 @@ class _Page:
 
 
 def _by_the_truth(file: Path, sent_ns: list[int]) -> tuple[list[float], list[float]]:
-    """For each stop the times, ms, until the wheels' speed began to fall for good, and until the body rested."""
+    """For each stop the times, ms, until the wheels' speed began to fall, and until the body rested; without those
+    before which the robot stood already, since its driver was late."""
     rows = list(read_motion(file))
     zero: list[float] = []
     rest: list[float] = []
     for at_ns in sent_ns:
-        after = [row for row in rows if at_ns <= row.real_ns < at_ns + 1_000_000_000]
+        after = [row for row in rows if at_ns <= row.real_ns < at_ns + WATCH_NS]
+        if not after or after[0].asked_mps < TURNS_MPS:
+            continue
         zero.append(_first(after, lambda row, before: row.asked_mps < before.asked_mps - 1e-6, at_ns))
         rest.append(_first(after, lambda row, _: row.moves_mps < RESTS_MPS, at_ns))
     return zero, rest
@@ -148,4 +156,4 @@ def _first(rows: list[MotionRow], is_it: Callable[[MotionRow, MotionRow], bool],
     for before, row in itertools.pairwise(rows):
         if is_it(row, before):
             return (row.real_ns - at_ns) / 1e6
-    raise CocoroError("the robot did not stop within a second")
+    raise CocoroError("the robot did not stop within two seconds")
