@@ -69,6 +69,7 @@ ENTRIES: dict[str, Entry] = {
     "installs": Entry("installs"),
     "mend": Entry("mend"),
     "network": Entry("network"),
+    "planner": Entry("planner"),
     "pursuit": Entry("pursuit"),
     "readme": Entry("readme"),
     "rehearsals": Entry("rehearsals"),

@@ -50,6 +50,7 @@ class ArmController:
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
         self._astray = False
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
@@ -113,9 +114,10 @@ class ArmController:
         dt_s: float,
         *,
         swing_radps: float | None = None,
+        roll_rad: float | None = None,
     ) -> ArmStep:
         """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first. It swings to the
-        front at `swing_radps` or, by default, as fast as it may."""
+        front at `swing_radps` or, by default, as fast as it may. `roll_rad`: the wrist's at the pose; None: level."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
@@ -131,7 +133,7 @@ class ArmController:
             stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
-            return self._cartesian(goal, speed_mps, dt_s)
+            return self._cartesian(goal, speed_mps, dt_s, roll_rad)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
         return self._joints(stage, dt_s, swing_radps if "arm_base" in stage else None)._replace(
             arrived=False, left=left_m
@@ -158,15 +160,23 @@ class ArmController:
         names = (*ARM, ROLL)
         if self._reference is None:
             self._reference = {name: measured[name] for name in names}
-        behind = False
+        behind = lags = False
         for name in names:
             lead = self._reference[name] - measured[name]
+            lags |= abs(lead) > self._config.wait_rad and name != ROLL
             if abs(lead) > self._config.lead_rad:
                 behind = True
                 self._clearance_m = None
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
+        self._lagged_s = self._lagged_s + dt_s if lags else 0.0
         return self._reference
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the goal stands until the joints are nearer to it. Commands or states are late then, and a joint that
+        lags alone would bring the hand off its way, down to the floor. What holds a joint up for longer is no delay."""
+        return 0.0 < self._lagged_s < self._config.wait_s
 
     def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
         """One step of the named joints to their goals; the others stay."""
@@ -180,7 +190,7 @@ class ArmController:
             trial[name] += scale * gap
         return self._commit(trial, widest * (1 - scale), dt_s, arrived=widest * (1 - scale) < 0.02)
 
-    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> ArmStep:
+    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float, roll_rad: float | None = None) -> ArmStep:
         assert self._reference is not None
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
@@ -190,7 +200,7 @@ class ArmController:
         for name in ARM:
             change = trial[name] - self._reference[name]
             trial[name] = self._reference[name] + min(max(change, -limit), limit)
-        roll_gap = self._roll_rad - self._reference[ROLL]
+        roll_gap = (self._roll_rad if roll_rad is None else roll_rad) - self._reference[ROLL]
         trial[ROLL] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
@@ -202,12 +212,13 @@ class ArmController:
         clearance_m = self.clearance.of(trial)
         before_m = self._clearance_m if self._clearance_m is not None else self.clearance.of(self._reference)
         blocked = clearance_m < self._config.clearance_m and clearance_m < before_m - 1e-6
-        if blocked:
+        waits = self._waits
+        if blocked or waits:
             trial = self._reference
         goal = np.array([trial[name] for name in ARM])
         moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
         # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
         self._reference = trial
-        self._clearance_m = before_m if blocked else clearance_m
-        return ArmStep(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)
+        self._clearance_m = before_m if blocked or waits else clearance_m
+        return ArmStep(goal, speed, trial[ROLL], left, arrived and not (blocked or waits), blocked)

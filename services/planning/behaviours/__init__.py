@@ -10,9 +10,11 @@ from cocoro.messages import actions
 from cocoro.messages.actions import Action
 from services.planning.behaviours.babbling import ArmBabbling, WheelBabbling
 from services.planning.behaviours.base import Actuators, Behaviour, Plan, Snapshot
+from services.planning.behaviours.by_hand import DrivingByHand
 from services.planning.behaviours.driving import Approaching, Carrying
 from services.planning.behaviours.following import Following
 from services.planning.behaviours.going import Going
+from services.planning.behaviours.going_there import GoingThere
 from services.planning.behaviours.handling import Closing, Lifting, PuttingDown, Reaching
 from services.planning.behaviours.looking import Exploring, Idling, Parking, Searching
 from services.planning.behaviours.touching import Touching
@@ -33,6 +35,8 @@ BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
     actions.Follow: Following,
     actions.Touch: Touching,
     actions.GoTo: Going,
+    actions.Drive: DrivingByHand,
+    actions.GoThere: GoingThere,
     actions.BabbleArm: ArmBabbling,
     actions.BabbleWheels: WheelBabbling,
 }
