@@ -257,7 +257,7 @@ async def test_requests_beyond_a_visitors_budget_are_refused_until_time_has_pass
 
 @in_virtual_time
 async def test_a_stop_has_a_budget_of_its_own() -> None:
-    rig = Rig(GateLimits(requests=Rate(1.0, 1.0), requests_all=Rate(1.0, 1.0), stops=Rate(1.0, 2.0)))
+    rig = Rig(GateLimits(requests=Rate(1.0, 1.0), stops=Rate(1.0, 2.0)))
     for _ in range(5):
         await ask(rig.app, head())
     for status in (200, 200, 429):
@@ -266,10 +266,33 @@ async def test_a_stop_has_a_budget_of_its_own() -> None:
 
 @in_virtual_time
 async def test_one_address_does_not_use_up_anothers_budget() -> None:
-    rig = Rig(GateLimits(requests=Rate(1.0, 1.0)))
-    for _ in range(5):
-        await ask(rig.app, head(client=("10.0.0.5", 1)))
-    assert (await ask(rig.app, head(client=("10.0.0.6", 1)))).status == 200
+    rig = Rig(GateLimits(requests=Rate(1.0, 1.0)), visitor=None)
+    for status in (401, 429, 429):
+        assert (await ask(rig.app, head(client=("10.0.0.5", 1)))).status == status
+    assert (await ask(rig.app, head(client=("10.0.0.6", 1)))).status == 401
+
+
+@in_virtual_time
+async def test_those_who_are_nobody_use_up_no_visitors_budget() -> None:
+    rig = Rig(visitor=None)
+    statuses = {(await ask(rig.app, head(client=(f"10.0.0.{number}", 1)))).status for number in range(200)}
+    assert statuses == {401, 503}
+    rig.gate.visitor = VIEWER
+    assert (await ask(rig.app, head())).status == 200
+
+
+@in_virtual_time
+async def test_stops_that_a_foreign_page_sends_use_up_nobodys_budget() -> None:
+    rig = Rig()
+    for _ in range(100):
+        await ask(rig.app, head("POST", "/stop", [("Origin", "http://evil.example")]))
+    assert (await ask(rig.app, head("POST", "/stop", [OWN]))).status == 200
+
+
+@in_virtual_time
+async def test_a_stop_is_one_whatever_comes_with_it() -> None:
+    rows = [OWN, ("Content-Type", "text/plain"), ("Content-Length", "4")]
+    assert (await ask(Rig().app, head("POST", "/stop", rows), b"stop")).status == 200
 
 
 @in_virtual_time
