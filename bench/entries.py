@@ -58,6 +58,7 @@ ENTRIES: dict[str, Entry] = {
     "bus": Entry("bus"),
     "capture-damage": Entry("capture_damage"),
     "clocks": Entry("clocks"),
+    "cockpit-hostile": Entry("cockpit_hostile"),
     "endings": Entry("endings"),
     "exports": Entry("exports"),
     "faults": Entry("faults"),

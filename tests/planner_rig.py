@@ -14,6 +14,7 @@ from cocoro.messages import (
     Detections,
     Intent,
     Message,
+    Motion,
     Obstacles,
     PlannerStatus,
     ServoCommand,
@@ -28,6 +29,8 @@ from services.planning.core import PlanningCore
 ROBOT = Robot.load()
 TICK_S = 0.02
 CAN_M = (1.5, 0.0, 0.06)
+SHOWN = {topics.PLAN.name, topics.FLOOR_PLAN.name}
+"""What it publishes that commands nothing."""
 
 
 class Planner:
@@ -40,7 +43,13 @@ class Planner:
         self.hand_load = 0.0
         self.latch = "released"
         self.wants: Intent | None = idle()
+        self.motion: Motion | None = None
+        """What the operator's hand wants."""
         self.sees: tuple[float, float, float] | None = CAN_M
+        self.free: tuple[tuple[float, float, float], ...] = tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))
+        """Free floor: bearings, and distances from and to."""
+        self.points: tuple[tuple[float, float, float], ...] = ()
+        """Obstacles, body frame."""
         self.silent: set[str] = set()
         self.incarnation = 1
         self._count = 0
@@ -57,11 +66,17 @@ class Planner:
             wants = self.wants
             self._feed(
                 topics.INTENT,
-                Intent(task_id=wants.task_id, step=wants.step, action=wants.action),
+                Intent(
+                    task_id=wants.task_id,
+                    step=wants.step,
+                    action=wants.action,
+                    motion=self.motion,
+                    motion_until_ns=test.now_ns + round(0.2e9) if self.motion is not None else 0,
+                ),
             )
         if self._count % 2 == 0:
             self._feed(topics.DETECTIONS, self._seen())
-            self._feed(topics.OBSTACLES, Obstacles(free=tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))))
+            self._feed(topics.OBSTACLES, Obstacles(free=self.free, points_m=self.points))
         self._count += 1
         test.step()
         status = self.status
@@ -90,7 +105,7 @@ class Planner:
     @property
     def commanded(self) -> set[str]:
         """The topics of the last step's commands."""
-        return {output.topic.name for output in self.under_test.steps[-1]} - {topics.PLAN.name}
+        return {output.topic.name for output in self.under_test.steps[-1]} - SHOWN
 
     def _feed(self, topic: Topic[Any], message: Message) -> None:
         if topic.name not in self.silent:

@@ -20,6 +20,7 @@ from cocoro.frames import Pose2, wrap_rad
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.escape import Escape
+from services.planning.floor_plan import Way
 from services.planning.navigation import Driver, Offset, offset_to
 from services.planning.surroundings import Fields, Surroundings, placed
 
@@ -106,6 +107,7 @@ class Course:
     ) -> Move:
         """One step towards a target (odometry frame). `folded`: the arm is not unfolded yet."""
         self._folded = folded
+        around.way = Way(target_m, np.empty((0, 2)))
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
@@ -124,6 +126,7 @@ class Course:
             move = Move(speed, turn, abs(offset.ahead_m), why, self._last_stretch)
         else:
             move, ahead = self._along(self._detour, body, fields, driver)
+        around.way = Way(target_m, ahead)
         return self._watch(move, ahead, body, around, fields, driver, now_ns)
 
     # --- planning ---------------------------------------------------------------------------------
