@@ -69,6 +69,7 @@ ENTRIES: dict[str, Entry] = {
     "hardware-faults": Entry("hardware_faults"),
     "idle": Entry("idle"),
     "installs": Entry("installs"),
+    "lost-control": Entry("lost_control"),
     "mend": Entry("mend"),
     "network": Entry("network"),
     "planner": Entry("planner"),
