@@ -59,6 +59,8 @@ ENTRIES: dict[str, Entry] = {
     "capture-damage": Entry("capture_damage"),
     "clocks": Entry("clocks"),
     "cockpit-hostile": Entry("cockpit_hostile"),
+    "cockpit-pictures": Entry("cockpit_pictures"),
+    "cockpit-stop": Entry("cockpit_stop"),
     "endings": Entry("endings"),
     "exports": Entry("exports"),
     "faults": Entry("faults"),

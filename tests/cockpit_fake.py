@@ -32,7 +32,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; manifest-src 'self';"
     " base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
-FPS = 12.0
+FPS = 8.0
 PATIENCE_S = 30.0
 LINE = {"level": "info", "service": "planning", "text": "drives around the box"}
 LINES: list[dict[str, Any]] = [{}, {"level": "warning", "service": "perception", "text": "a frame was late: 140 ms"}]

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page, expect
 pytestmark = [pytest.mark.process, pytest.mark.zenoh]
 
 DRIVING = "#app[data-driving]"
-BROKEN = """{
+BROKEN = """() => {
     const send = WebSocket.prototype.send;
     WebSocket.prototype.send = function (text) {
         if (text.includes('"stop"')) throw new Error("no network");
@@ -23,6 +23,17 @@ BROKEN = """{
     };
 }"""
 """Sockets take everything but a stop."""
+TOO_SOON = """() => {
+    const release = document.getElementById("release");
+    const watch = new MutationObserver(() => {
+        if (release.hidden) return;
+        watch.disconnect();
+        release.click();
+        window.pressed = true;
+    });
+    watch.observe(release, { attributes: true });
+}"""
+"""Releases the robot in the moment in which that can be done."""
 
 
 @pytest.fixture(scope="module")
@@ -213,10 +224,10 @@ def test_stop_stays_where_it_is_and_is_not_followed_by_a_release_under_the_finge
     page: Page, fake: FakeCockpit
 ) -> None:
     before = page.locator("#stop").bounding_box()
+    page.evaluate(TOO_SOON)
     page.click("#stop")
-    page.wait_for_selector("#release:visible")
+    page.wait_for_function("window.pressed")
     assert page.locator("#stop").bounding_box() == before
-    page.evaluate("document.getElementById('release').click()")  # a press in the same moment
     page.keyboard.press("Space")
     fake.until(lambda: len(fake.done("stop")) >= 2)
     assert not fake.done("reset")
