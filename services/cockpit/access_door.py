@@ -321,7 +321,7 @@ class Door:
         self.connections[address] = connection
         task = self.loop.create_task(self._connect(taken, connection))
         self._shaking.add(task)
-        task.add_done_callback(self._shaking.discard)
+        task.add_done_callback(lambda done: self._connected(done, taken, connection))
         return True
 
     def _no_room(self, key: str) -> str:
@@ -354,18 +354,23 @@ class Door:
 
     async def _connect(self, taken: socket.socket, connection: Connection) -> None:
         seconds = HANDSHAKE_S if self.context is not None else None
-        try:
-            await self.loop.connect_accepted_socket(
-                lambda: connection, taken, ssl=self.context, ssl_handshake_timeout=seconds
-            )
-        except (OSError, asyncio.CancelledError) as error:  # of which ssl.SSLError is one
-            self.left(connection)
-            with suppress(OSError):
-                taken.close()
-            if isinstance(error, asyncio.CancelledError):
-                raise
+        await self.loop.connect_accepted_socket(
+            lambda: connection, taken, ssl=self.context, ssl_handshake_timeout=seconds
+        )
+
+    def _connected(self, task: asyncio.Task[None], taken: socket.socket, connection: Connection) -> None:
+        self._shaking.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is None and not task.cancelled():
+            return
+        self.left(connection)
+        with suppress(OSError):
+            taken.close()
+        if isinstance(error, OSError):  # of which ssl.SSLError is one
             what = getattr(error, "reason", None) or type(error).__name__
             self.audit.refused(connection.key, "connection: TLS handshake failed", str(what))
+        elif error is not None:
+            raise error
 
     # --- those that were taken --------------------------------------------------------------------
 
