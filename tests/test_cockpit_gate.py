@@ -9,6 +9,7 @@ from cocoro.testing import in_virtual_time
 from services.cockpit import access_rules as rules
 from services.cockpit.access import GateLimits, Message, Receive, Send, Visitor
 from services.cockpit.access_limits import Rate
+from services.cockpit.access_passage import Passage
 from services.cockpit.access_rules import Scope
 
 OWN = ("Origin", f"http://{HOST}")
@@ -25,7 +26,7 @@ class Rig:
         self.gate = Fixed(audit=self.audit, limits=limits, clock=lambda: self.now_s)
         self.gate.visitor = visitor
         self.echo = Echo()
-        self.app = self.gate.app(self.echo)
+        self.app = Passage(self.gate, self.echo)
 
     async def refused(self, status: int, what: str, *given: object, **more: object) -> Answer:
         """Asks, and checks that it is refused, that the log says so, and that the service never saw it."""
@@ -368,7 +369,7 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 async def test_a_socket_ends_with_its_visitors_session() -> None:
     rig = Rig(visitor=VIEWER)
 
-    app = rig.gate.app(rig.echo)
+    app = Passage(rig.gate, rig.echo)
 
     async def hurrying(scope: Scope, receive: Receive, send: Send) -> None:
         async def later() -> Message:

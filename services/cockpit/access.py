@@ -110,12 +110,6 @@ class Gate:
 
     # --- what the service asks --------------------------------------------------------------------
 
-    def app(self, inner: App) -> App:
-        """The application behind the gate."""
-        from services.cockpit.access_passage import Passage
-
-        return Passage(self, inner)
-
     def who(self, scope: Scope) -> Visitor | None:
         """The visitor of a request; None when it is nobody's."""
         found = scope.get(rules.VISITOR)

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from services.cockpit import access_rules as rules
+from services.cockpit.access import App, Gate, Message, Receive, Send, Visitor
 from services.cockpit.access_limits import Bucket
 from services.cockpit.access_rules import VISITOR, Refusal, Scope
-
-if TYPE_CHECKING:
-    from services.cockpit.access import App, Gate, Message, Receive, Send, Visitor
 
 TOO_LONG, NO_TEXT, TOO_MANY, ENDED = 1009, 1003, 1008, 4401
 """Codes with which a socket is closed; the last is the cockpit's own: the visitor's session has ended."""
