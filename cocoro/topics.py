@@ -188,6 +188,10 @@ PLAN = Topic(
     "What the planner does, and the reason. Beyond its age the running task fails.",
     shown=True,
 )  # fmt: skip
+FLOOR_PLAN = Topic(
+    "planning/map", m.FloorPlan, Qos.STATE, 2.0, 3.0,
+    "The floor as the planner knows it, and the way that it drives, for who looks on. Older ones are shown as old.",
+)  # fmt: skip
 HAND_SAMPLES = Topic(
     "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,
     "One sample of the arm's babbling: joint angles, and the position of the hand's marker at that time.",
@@ -243,7 +247,7 @@ RECORDING = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, OBSTACLES, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
+    DETECTIONS, OBSTACLES, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
     HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
 )  # fmt: skip
 
@@ -268,6 +272,11 @@ REPORT = Request(
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,
     "The known objects, and where each was seen last.",
+    right="see",
+)  # fmt: skip
+TASKS = Request(
+    "executive/tasks", m.TasksRequest, m.TasksReply,
+    "The tasks that can be asked for, each with its options.",
     right="see",
 )  # fmt: skip
 ESTOP = Request(
@@ -315,5 +324,5 @@ STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
 REQUESTS: tuple[Request[Any, Any], ...] = (
-    RUN, CANCEL, DRIVE, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
+    RUN, CANCEL, DRIVE, REPORT, OBJECTS, TASKS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
 )  # fmt: skip

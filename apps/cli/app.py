@@ -60,6 +60,8 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.kinect import app
         case "site":
             from apps.cli.site import app
+        case "cockpit":
+            from apps.cli.cockpit import app
         case "pki":
             from apps.cli.pki import app
         case "doctor":

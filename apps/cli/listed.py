@@ -41,6 +41,7 @@ _SUMMARIES = {
         "echo": "Messages of a key, decoded, of any type; one that a reader would reject is marked with the reason.",
         "hz": "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds.",
         "logs": "Logs of the robot's processes on this machine since their start, merged by time.",
+        "cockpit": "Let persons into the cockpit from other machines; list them, end it.",
         "site": "Check the plan of several machines; show it, its steps and its rules.",
         "pki": "Issue, renew and revoke the certificates of a site; list them.",
         "new": "Write a component (`new service NAME`) or a task (`new task NAME`) from a template.",

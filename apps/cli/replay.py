@@ -12,7 +12,6 @@ import msgspec
 import typer
 
 from apps.captures.info import left_out_notes
-from apps.captures.player import Player
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
@@ -21,6 +20,7 @@ from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
 from apps.cli.terminal import StatusLine
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
