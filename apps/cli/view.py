@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Condition
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import msgspec
 import typer
@@ -30,7 +30,6 @@ from cocoro.messages import AboutRequest, Message
 from cocoro.topics import ABOUT, FRAME, TOPICS, Topic
 
 if TYPE_CHECKING:
-    from apps.captures.export.rerun_scene import RerunScene
     from sim.outside import OutsideStage
 
 PER_SERVICE = "{service}"
@@ -58,7 +57,10 @@ def view(
     ] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve it as a page for a browser; needs no display.")] = False,
     bind: Annotated[
-        str, typer.Option("--bind", metavar="ADDRESS", help="With --web: serve it here; 0.0.0.0 is every address.")
+        str,
+        typer.Option(
+            "--bind", metavar="ADDRESS", help="With --web or --foxglove: serve it here; 0.0.0.0 is every address."
+        ),
     ] = "127.0.0.1",
     save: Annotated[
         Path | None, typer.Option("--save", metavar="OUT.rrd", help="Write it to a file for Rerun; needs no display.")
@@ -66,10 +68,38 @@ def view(
     connect: Annotated[
         str | None, typer.Option("--connect", metavar="HOST[:PORT]", help="Send it to a viewer that runs there.")
     ] = None,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve the running robot to Foxglove; needs cocoro-mesh[foxglove].")
+    ] = False,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="With --foxglove: serve it here, by default 8765.")
+    ] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option("--layout", metavar="OUT.json", help="With --foxglove: write the layout that Foxglove imports."),
+    ] = None,
+    operate: Annotated[
+        bool,
+        typer.Option("--operate", help="With --foxglove: take tasks, too, from every program on this machine."),
+    ] = False,
     robot: RobotOption = None,
     site: ThroughOption = None,
 ) -> None:
-    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
+    """Open Rerun on a capture, or live on the mesh; or serve the robot to Foxglove. Needs the extra `view` or
+    `foxglove`."""
+    if foxglove:
+        others = {"a FILE": file, "--sim": sim, "--web": web, "--save": save, "--connect": connect}
+        if given := [name for name, value in others.items() if value]:
+            raise ConfigError(
+                f"--foxglove shows the running robot: leave out {', '.join(given)}; "
+                "for a capture there is `cocoro export FILE --foxglove OUT.mcap`"
+            )
+        from apps.cli import view_foxglove
+
+        place = view_foxglove.Place(bind, view_foxglove.DEFAULT_PORT if port is None else port, operate, layout)
+        sys.exit(asyncio.run(view_foxglove.serve(RobotChoice(robot, site), place)))
+    if port is not None or layout is not None or operate:
+        raise ConfigError("--port, --layout and --operate are for --foxglove; give that, too")
     target = Target(save=save, web=web, bind=bind, connect=connect)
     if file is not None:
         sys.exit(view_file(file, target, sim))
@@ -200,6 +230,13 @@ async def _stated_stage(link: MeshLink) -> OutsideStage:
     raise ConfigError(f"--sim: {link.robot} has no simulator that runs; leave --sim out to see what the robot reports")
 
 
+class Scene(Protocol):
+    """A viewer's scene of a robot."""
+
+    def log(self, topic: str, message: Message) -> object:
+        """Show a message of the topic of a name."""
+
+
 class Waiting:
     """Messages on their way to the viewer, which a thread of its own logs: the mesh never waits for a viewer."""
 
@@ -225,9 +262,9 @@ class Waiting:
             self._open = False
             self._changed.notify()
 
-    def log_to(self, scene: RerunScene) -> None:
-        """Log the queued messages until `close`. Raises ConfigError when the truth is of another scene than the one
-        stated."""
+    def log_to(self, scene: Scene) -> None:
+        """Log the queued messages until `close`. Raises ConfigError when Rerun is given the truth of another scene than
+        the one stated."""
         while True:
             with self._changed:
                 while self._open and not self._messages:
