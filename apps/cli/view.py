@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from threading import Condition
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
@@ -22,21 +19,16 @@ from apps.cli.export import progress_bar
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice, RobotOption, ThroughOption, capture_file
-from cocoro.bus.base import Bus, Payload
+from apps.cli.viewed import Waiting, watch
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError
-from cocoro.messages import AboutRequest, Message
-from cocoro.topics import ABOUT, FRAME, TOPICS, Topic
+from cocoro.messages import AboutRequest
+from cocoro.topics import ABOUT
 
 if TYPE_CHECKING:
     from sim.outside import OutsideStage
 
-PER_SERVICE = "{service}"
-DEPTH = 4
-"""Messages of one key that may wait; a viewer that is late shows the newest."""
-WAITING, WAITING_FRAMES = 500, 2
-"""Messages, and frames among them, that may wait for the viewer."""
 FLUSH_S = 10.0
 LOOK_S = 0.2
 """How often it is seen that the viewer was closed."""
@@ -228,61 +220,3 @@ async def _stated_stage(link: MeshLink) -> OutsideStage:
         if answer.reply is not None and answer.reply.module in SIMULATORS:
             return stated_stage(answer.reply)
     raise ConfigError(f"--sim: {link.robot} has no simulator that runs; leave --sim out to see what the robot reports")
-
-
-class Scene(Protocol):
-    """A viewer's scene of a robot."""
-
-    def log(self, topic: str, message: Message) -> object:
-        """Show a message of the topic of a name."""
-
-
-class Waiting:
-    """Messages on their way to the viewer, which a thread of its own logs: the mesh never waits for a viewer."""
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._messages: deque[tuple[str, Message]] = deque()
-        self._changed = Condition()
-        self._open = True
-
-    def put(self, topic: str, message: Message) -> None:
-        """Queue a message to be logged. When too many wait it is dropped, a frame earlier than others."""
-        with self._changed:
-            frames = sum(name == FRAME.name for name, _ in self._messages) if topic == FRAME.name else 0
-            if len(self._messages) >= WAITING or frames >= WAITING_FRAMES:
-                self.dropped += 1
-                return
-            self._messages.append((topic, message))
-            self._changed.notify()
-
-    def close(self) -> None:
-        """Take no more messages. Those that wait are still logged."""
-        with self._changed:
-            self._open = False
-            self._changed.notify()
-
-    def log_to(self, scene: Scene) -> None:
-        """Log the queued messages until `close`. Raises ConfigError when Rerun is given the truth of another scene than
-        the one stated."""
-        while True:
-            with self._changed:
-                while self._open and not self._messages:
-                    self._changed.wait()
-                if not self._messages:
-                    return
-                topic, message = self._messages.popleft()
-            scene.log(topic, message)
-
-
-def watch(bus: Bus, robot: str, waiting: Waiting) -> None:
-    """Keeps every message that arrives from now on for the viewer, however old it is: a viewer controls nothing."""
-
-    def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
-        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            waiting.put(topic.name, decoder.decode(bytes(payload)))  # a copy: the bus takes its memory back
-
-    for topic in TOPICS:
-        if PER_SERVICE not in topic.name:
-            handler = partial(receive, topic, msgspec.msgpack.Decoder(topic.type))
-            bus.subscribe(topic.key(robot), topic.qos, handler, depth=DEPTH)

@@ -24,7 +24,7 @@ from apps.cli.estop import by_path
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined, through_site
 from apps.cli.options import RobotChoice
-from apps.cli.view import FLUSH_S, LOOK_S, PER_SERVICE, Waiting, watch
+from apps.cli.viewed import PER_SERVICE, Waiting, watch
 from cocoro.bus.base import Handle
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import CancelRequest, EstopRequest, TaskRequest
@@ -35,6 +35,8 @@ from services.executive.tasks import TASKS
 
 DEFAULT_PORT = 8765
 """Foxglove's own."""
+FLUSH_S, LOOK_S = 10.0, 0.2
+"""Longest wait for what is still to be shown at the end, and the period of looking for the end."""
 ANSWER_S = 5.0
 TRIES = 3
 """Requests to stop, on the mesh, while a service has not acknowledged."""
