@@ -21,18 +21,25 @@ PATIENCE_S = 30.0
 class Viewer:
     """Connects to a server's address, `ws://...`, and learns its topics and services. A context manager."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, origin: str | None = None) -> None:
+        """`origin`: whose page it is on, as a browser says. Raises ConnectionError with the server's text when it is
+        refused."""
         where = urlsplit(address)
         assert where.hostname is not None
         self._socket = socket.create_connection((where.hostname, where.port or 80), PATIENCE_S)
         self._bytes = self._socket.makefile("rb")
         key = base64.b64encode(os.urandom(16)).decode()
+        came = "" if origin is None else f"Origin: {origin}\r\n"
         self._socket.sendall(
             f"GET / HTTP/1.1\r\nHost: {where.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"{came}"
             f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
             .encode()
         )  # fmt: skip
-        assert b"101" in self._bytes.readline()
+        if b"101" not in self._bytes.readline():
+            why = self._bytes.read().decode()
+            self.close()
+            raise ConnectionError(why)
         while self._bytes.readline().strip():
             pass
         self.channels: dict[str, dict[str, Any]] = {}
@@ -49,6 +56,9 @@ class Viewer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._bytes.close()
         self._socket.close()
 

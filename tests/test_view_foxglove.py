@@ -6,6 +6,8 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,9 @@ from apps.captures.export.foxglove_layout import layout
 from apps.captures.export.foxglove_scene import TOPICS as SHOWN
 from apps.captures.export.foxglove_scene import FoxgloveScene
 from apps.captures.export.foxglove_server import FoxgloveServer, Service
+from apps.cli.foxglove_door import HEAD_BYTES, Door, hidden_address, why_not
 from apps.cli.main import main
-from apps.cli.view_foxglove import Asked
+from apps.cli.view_foxglove import Asked, address_of
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.errors import ConfigError, RefusedError
@@ -178,6 +181,67 @@ def test_a_clock_that_begins_anew_begins_a_new_session(server: FoxgloveServer) -
 def test_a_port_that_is_taken_is_told_with_what_to_do(server: FoxgloveServer) -> None:
     with pytest.raises(ConfigError, match=f"127.0.0.1:{server.port}.*give another --port"):
         FoxgloveServer("ada", ROBOT, Catalogue.load(), [], host="127.0.0.1", port=server.port)
+
+
+# --- the door ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [None, "https://app.foxglove.dev", "https://foxglove.dev", "app://foxglove", "file://"],
+)
+def test_programs_and_the_pages_of_foxglove_are_let_through(server: FoxgloveServer, origin: str | None) -> None:
+    assert through_the_door(server, origin) == ""
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["https://evil.example", "null", "http://app.foxglove.dev", "https://foxglove.dev.evil.example",
+     "https://evilfoxglove.dev", "http://127.0.0.1:8080", ""],
+)  # fmt: skip
+def test_pages_of_others_are_not_and_are_told_why(server: FoxgloveServer, origin: str) -> None:
+    assert "may not reach the robot" in through_the_door(server, origin)
+
+
+def through_the_door(server: FoxgloveServer, origin: str | None) -> str:
+    """Why a viewer from there is refused; '' when he sees the robot."""
+
+    def look(address: str) -> str:
+        try:
+            with Viewer(address, origin) as viewer:
+                return "" if viewer.ask("/task/fetch", label="red_can")["accepted"] else "not accepted"
+        except ConnectionError as refused:
+            return str(refused)
+
+    async def run() -> str:
+        async with Door("127.0.0.1", 0, (server.host, server.port)) as door:
+            return await asyncio.to_thread(look, address_of("127.0.0.1", door.port))
+
+    return asyncio.run(run())
+
+
+def test_a_head_without_an_end_or_of_trickery_is_not_let_through() -> None:
+    assert why_not(b"GET / HTTP/1.1\r\nOrigin:\r\n https://app.foxglove.dev\r\n\r\n")
+    assert why_not(b"GET / HTTP/1.1\r\nORIGIN : https://evil.example\r\n\r\n")
+    both = b"GET / HTTP/1.1\r\nOrigin: https://app.foxglove.dev\r\nOrigin: https://evil.example\r\n\r\n"
+    assert why_not(both)
+
+    async def run() -> int:
+        async with Door("127.0.0.1", 0, ("127.0.0.1", 1)) as door:
+            reader, writer = await asyncio.open_connection("127.0.0.1", door.port)
+            writer.write(b"x" * 3 * HEAD_BYTES)
+            left = len(await reader.read())
+            writer.close()
+            return left
+
+    with suppress(ConnectionError):
+        assert asyncio.run(run()) == 0
+
+
+def test_the_server_itself_hides_at_another_address_each_time() -> None:
+    drawn = {hidden_address() for _ in range(50)}
+    assert len(drawn) > 45
+    assert all(ip_address(one).is_loopback for one in drawn)
 
 
 # --- what is asked of the robot ---------------------------------------------------------------------

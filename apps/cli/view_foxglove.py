@@ -13,7 +13,8 @@ from contextlib import suppress
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from urllib.parse import urlencode
 
 import msgspec
 
@@ -21,6 +22,7 @@ from apps.captures.export.files import making
 from apps.captures.export.viewer import Attempt
 from apps.cli import exits
 from apps.cli.estop import by_path
+from apps.cli.foxglove_door import Door, hidden_address
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined, through_site
 from apps.cli.options import RobotChoice
@@ -32,6 +34,9 @@ from cocoro.topics import CANCEL, ESTOP, RUN, TOPICS
 from deploy.processes import stoppable
 from services.executive.askers import asker_key
 from services.executive.tasks import TASKS
+
+if TYPE_CHECKING:
+    from apps.captures.export.foxglove_server import FoxgloveServer
 
 DEFAULT_PORT = 8765
 """Foxglove's own."""
@@ -83,29 +88,46 @@ async def serve(choice: RobotChoice, place: Place) -> int:
         topics = [topic for topic in TOPICS if PER_SERVICE not in topic.name]
         with FoxgloveServer(
             link.robot, link.described(), link.catalogue(), topics,
-            host=place.bind, port=place.port, services=asked.services(operate=place.operate),
+            host=hidden_address(), port=0, services=asked.services(operate=place.operate),
         ) as server:  # fmt: skip
-            print(f"{link.robot} is at {server.address}: open {server.link}")
-            if place.layout is not None:
-                print(f"{place.layout}: import it there, under Layouts")
-            if place.operate:
-                print("it takes tasks from every program on this machine, pages in its browsers included")
-            print("Ctrl-C ends it", flush=True)
-            waiting = Waiting()
-            watch(link.bus, link.robot, waiting)
-            showing = Attempt(partial(waiting.log_to, server))
-            try:
-                with interrupt_event() as end:
-                    while not end.is_set() and not showing.join(0.0):
-                        with suppress(TimeoutError):
-                            async with asyncio.timeout(LOOK_S):
-                                await end.wait()
-            finally:
-                waiting.close()
-                asked.close()
-            if showing.join(FLUSH_S):
-                showing.result()
+            async with Door(place.bind, place.port, (server.host, server.port)) as door:
+                address = address_of(place.bind, door.port)
+                print(f"{link.robot} is at {address}: open {page_of(address)}")
+                if place.layout is not None:
+                    print(f"{place.layout}: import it there, under Layouts")
+                if place.operate:
+                    print("it takes tasks from every program on this machine")
+                print("Ctrl-C ends it", flush=True)
+                await _show(link, server, asked)
     return exits.DONE
+
+
+async def _show(link: MeshLink, server: FoxgloveServer, asked: Asked) -> None:
+    """Give the server every message of the mesh, until Ctrl-C."""
+    waiting = Waiting()
+    watch(link.bus, link.robot, waiting)
+    showing = Attempt(partial(waiting.log_to, server))
+    try:
+        with interrupt_event() as end:
+            while not end.is_set() and not showing.join(0.0):
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(LOOK_S):
+                        await end.wait()
+    finally:
+        waiting.close()
+        asked.close()
+    if showing.join(FLUSH_S):
+        showing.result()
+
+
+def address_of(host: str, port: int) -> str:
+    """Where a viewer connects to, `ws://...`."""
+    return f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def page_of(address: str) -> str:
+    """The page of Foxglove that opens an address."""
+    return f"https://app.foxglove.dev/?{urlencode({'ds': 'foxglove-websocket', 'ds.url': address})}"
 
 
 class Asked:

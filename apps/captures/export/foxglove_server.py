@@ -6,6 +6,7 @@ one does not take in time is dropped.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 
+logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # each viewer that is gone is an error to it
 BACKLOG = 256
 """Messages that may wait for a viewer; the oldest are dropped."""
 AGAIN_NS = NS
@@ -58,7 +60,10 @@ class FoxgloveServer:
         services: Iterable[Service] = (),
     ) -> None:
         """`name`: the robot's on the mesh. `topics`: those whose messages are there as JSON, for plots, beside what is
-        shown. `port`: 0 is any free one. Raises ConfigError when nobody can listen there."""
+        shown. `port`: 0 is any free one. Raises ConfigError when nobody can listen there.
+
+        The server asks nobody where he comes from; `apps.cli.foxglove_door` does.
+        """
         self._context = foxglove.Context()
         self._shown = {
             topic: getattr(channels, f"{kind.__name__}Channel")(topic, context=self._context)
@@ -97,11 +102,6 @@ class FoxgloveServer:
     def address(self) -> str:
         """Where a viewer connects to, `ws://...`."""
         return f"ws://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
-
-    @property
-    def link(self) -> str:
-        """The page of Foxglove that opens this server."""
-        return self._server.app_url() or ""
 
     def log(self, topic: str, message: Message) -> None:
         """Show one of the mesh's messages, of the topic of a name. To be called in one thread."""
