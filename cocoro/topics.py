@@ -253,6 +253,11 @@ CANCEL = Request(
     "executive/cancel", m.CancelRequest, m.TaskReply,
     "End the running task; the robot stops.",
 )  # fmt: skip
+DRIVE = Request(
+    "executive/drive", m.DriveRequest, m.DriveReply,
+    "One input of an operator who drives by hand; it moves the robot for at most 0.2 s.",
+    timeout_s=0.5,
+)  # fmt: skip
 REPORT = Request(
     "executive/report", m.ReportRequest, m.TaskState,
     "The state of a task, running or ended; one without an id for a task that is not known.",
@@ -308,5 +313,5 @@ STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
 REQUESTS: tuple[Request[Any, Any], ...] = (
-    RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
+    RUN, CANCEL, DRIVE, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
 )  # fmt: skip

@@ -19,6 +19,7 @@ from cocoro.messages.common import (
     LatchState,
     Message,
 )
+from cocoro.messages.driving import DriveReply, DriveRequest, Motion
 from cocoro.messages.executive import (
     CancelRequest,
     KnownObject,
@@ -86,6 +87,8 @@ __all__ = [
     "Detection",
     "Detections",
     "DisturbedFile",
+    "DriveReply",
+    "DriveRequest",
     "EstopReply",
     "EstopRequest",
     "Exchange",
@@ -106,6 +109,7 @@ __all__ = [
     "Message",
     "ModelReply",
     "ModelRequest",
+    "Motion",
     "ObjectsReply",
     "ObjectsRequest",
     "Obstacles",

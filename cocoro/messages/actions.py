@@ -99,6 +99,10 @@ class GoTo(Action, frozen=True, tag="go-to"):
     """From the body's centre to the object's, over the floor, at the end."""
 
 
+class Drive(Action, frozen=True, tag="drive"):
+    """Do what the operator's hand wants now: the motion in the intent, while it counts. Has no end."""
+
+
 class BabbleArm(Action, frozen=True, tag="babble-arm"):
     """Move the arm from draw to draw and report where the hand is seen."""
 
@@ -127,8 +131,8 @@ def _brought() -> Iterator[type[Action]]:
 ACTIONS: Registry[Action] = Registry(
     "action",
     (
-        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, BabbleArm,
-        BabbleWheels,
+        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, Drive,
+        BabbleArm, BabbleWheels,
     ),
     _brought,
 )  # fmt: skip

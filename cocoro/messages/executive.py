@@ -48,6 +48,8 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     """None: the task's own limit."""
     asker: str = ""
     """When the liveliness token `<robot>/<asker>/asker` is gone, the task is cancelled. Empty: nobody is watched."""
+    instead: bool = False
+    """Cancel the running task, wait until the robot is at rest, then start this one. Without, it is refused as busy."""
 
 
 RefusalCode = Literal[
