@@ -53,6 +53,7 @@ ENTRIES: dict[str, Entry] = {
     "simulator": Entry("simulator", "suite"),
     "capture": Entry("capture", "suite"),
     "capture-format": Entry("capture_format", "suite"),
+    "open": Entry("open_capture", "suite"),
     "live": Entry("live", "suite"),
     "alarms": Entry("alarms"),
     "bus": Entry("bus"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Generator
+from collections.abc import AsyncGenerator, Generator
 from typing import Any
 
 import msgspec
@@ -64,6 +64,8 @@ class TaskHandle(Watcher):
         self._accepted: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._accepted.add_done_callback(_retrieved)
         self._run = TaskRun(participant, request, self, contact or Contact(), watched=not detached)
+        if attended is not None:
+            self._run.attend(attended)
         self._work = asyncio.ensure_future(self._carry_out(attended))
         self._work.add_done_callback(_retrieved)
 
@@ -112,7 +114,7 @@ class TaskHandle(Watcher):
             raise self._closed()
         return self._work.result()
 
-    async def __aiter__(self) -> AsyncIterator[TaskState]:
+    async def __aiter__(self) -> AsyncGenerator[TaskState, None]:
         """Each state from now on, the newest known one first; the last one has its outcome."""
         states: asyncio.Queue[TaskState | None] = asyncio.Queue()
         if self.state is not None:
@@ -197,7 +199,6 @@ class TaskHandle(Watcher):
 
     async def _follow_from(self, state: TaskState) -> TaskResult:
         self._run.listen()
-        self._run.attend(state)
         self._accepted.set_result(state.task_id)
         return self._result_of(state) if state.outcome is not None else await self._followed()
 

@@ -43,6 +43,8 @@ class MeshLink(Onlooker):
         be sent, as the site's rules have it."""
         super().__init__(run_dir, bus, private)
         self._refusal = refusal
+        self.here = refusal is None
+        """Whether the robot is on this machine, not beyond a site's gateway."""
 
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
         if self._refusal is not None and (why := self._refusal(request.key(self.robot_name))):

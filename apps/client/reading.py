@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -33,7 +33,7 @@ def reading(participant: Participant, topic: Topic[M], reader: Callable[[M], Non
             participant.drop(topic)
 
 
-async def watched(participant: Participant, topic: Topic[M]) -> AsyncIterator[M]:
+async def watched(participant: Participant, topic: Topic[M]) -> AsyncGenerator[M, None]:
     """The messages of a topic as they come, without end. As everywhere on the mesh the newest replaces those that were
     not taken yet, and events are all kept."""
     waiting: deque[M] = deque(maxlen=None if topic.qos is Qos.EVENT else 1)

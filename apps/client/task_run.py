@@ -7,22 +7,24 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
-from typing import Generic
+from contextlib import ExitStack, suppress
+from typing import Generic, TypeVar
 
 import msgspec
 
 from apps.client.looking_again import EXECUTIVE, LATE_S, LookingAgain, LostTaskError, P, Rejoin
 from cocoro.bus.base import Handle
 from cocoro.contact import Contact
+from cocoro.driving import BEGIN_S
 from cocoro.errors import CallTimeoutError, CocoroError
-from cocoro.inbox import Inbox
-from cocoro.messages import CancelRequest, Message, Recording, TaskReply, TaskRequest, TaskState
+from cocoro.messages import CancelRequest, Message, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
-from cocoro.topics import CANCEL, LATCH, RECORDING, RUN, TASK
+from cocoro.topics import CANCEL, LATCH, RECORDING, RUN, TASK, Topic
 from services.executive.askers import asker_key
 
 __all__ = ["EXECUTIVE", "LostTaskError", "Rejoin", "TaskRun"]
+
+M = TypeVar("M", bound=Message)
 
 UNSETTLED_S = {"not_alive": 3.0, "estop": 10.0, "asker_gone": 3.0}
 """Longest time for which such a refusal is answered by another request: an executive that has just started may not have
@@ -81,7 +83,7 @@ class TaskRun(Generic[P]):
         """States of the task, and whether the executive's liveliness token is present, at each change."""
         self._files: dict[str, str] = {}
         """The file in which a task is recorded, by its id."""
-        self._listening: list[tuple[Inbox[Message], Callable[[str, Message], None]]] = []
+        self._listening = ExitStack()
         self._let_go = asyncio.Event()
 
     @property
@@ -106,25 +108,21 @@ class TaskRun(Generic[P]):
 
     def listen(self) -> None:
         """Keeps the states of tasks from now on. Call it before the task is requested, so that no state is missed."""
-        for topic, reader in ((TASK, self._on_state), (RECORDING.of(RECORDER), self._on_recording)):
-            inbox: Inbox[Message] = self.link.inbox(topic)  # type: ignore[assignment] # each reader fits its topic
-            inbox.add(reader)
-            self._listening.append((inbox, reader))
+        self._hear(TASK, self._news.put_nowait)
+        self._hear(RECORDING.of(RECORDER), lambda recording: self._files.update({recording.task_id: recording.file}))
+
+    def _hear(self, topic: Topic[M], reader: Callable[[M], None]) -> None:
+        def take(_key: str, message: M) -> None:
+            reader(message)
+
+        inbox = self.link.inbox(topic)
+        inbox.add(take)
+        self._listening.callback(inbox.remove, take)
 
     def close(self) -> None:
         """Ends the listening, and the presence."""
-        for inbox, reader in self._listening:
-            inbox.remove(reader)
-        self._listening.clear()
+        self._listening.close()
         self.leave()
-
-    def _on_state(self, _key: str, state: Message) -> None:
-        assert isinstance(state, TaskState)
-        self._news.put_nowait(state)
-
-    def _on_recording(self, _key: str, recording: Message) -> None:
-        assert isinstance(recording, Recording)
-        self._files[recording.task_id] = recording.file
 
     # --- the request ------------------------------------------------------------------------------
 
@@ -148,16 +146,18 @@ class TaskRun(Generic[P]):
         latch = self.link.latest(LATCH)
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
+        patience_of_call_s = BEGIN_S if self._request.instead else None
         try:
             while not self._let_go.is_set():
-                reply = await self.link.call(RUN, self._request)
+                reply = await self.link.call(RUN, self._request, patience_of_call_s)
                 latched = latch.value is not None and latch.value.state == "latched"
                 patience_s = 0.0 if reply.accepted or latched else UNSETTLED_S.get(reply.refusal or "", 0.0)
                 if loop.time() - begun_s >= patience_s:
                     self.task_id = reply.task_id
                     return reply
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._let_go.wait(), ASK_AGAIN_S)
+                    async with asyncio.timeout(ASK_AGAIN_S):
+                        await self._let_go.wait()
             return None
         finally:
             latch.close()
@@ -219,14 +219,16 @@ class TaskRun(Generic[P]):
     async def _heard(self, timeout_s: float) -> bool:
         """Waits for a sign of the executive; its state of the task is asked for then, since some may have been lost."""
         with suppress(TimeoutError):
-            return await asyncio.wait_for(self._news.get(), timeout_s) is not False
+            async with asyncio.timeout(timeout_s):
+                return await self._news.get() is not False
         return False
 
     async def _next_news(self) -> TaskState | bool:
         """The next news to arrive; the executive's answer when none arrives for long although it is present."""
         while True:
             with suppress(TimeoutError):
-                return await asyncio.wait_for(self._news.get(), LATE_S)
+                async with asyncio.timeout(LATE_S):  # `wait_for` may swallow a cancellation that comes with news
+                    return await self._news.get()
             if (state := await self._looking.ask(self.task_id)) is not None:
                 return state
 
