@@ -1,8 +1,9 @@
 """The time on the way from host to host: `python -m bench site-latency`.
 
 A wheel command from a Node on the brain's host to a Node on the robot's, by both hosts' gateways, with mutual TLS,
-access rules and all limits; beside it, in turns in the same processes, raw zenoh over TLS straight from one program to
-the other. Frames go another way: `python -m bench site-frames`.
+access rules and all limits. Beside it, in turns in the same processes, raw zenoh over TLS: straight from one program to
+the other, which is one connection where the Node's way is three; and over a bare router on each host, which is the
+same way without anything of this project. Frames go another way: `python -m bench site-frames`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import msgspec
 
 from bench.report import Report
 from bench.site_lab import ROBOT, Lab, lab
-from bench.site_speaker import HZ
+from bench.site_speaker import DIRECT, HZ, NODE, ROUTED, ROUTER
 from bench.trials import number_of, sized
 from cocoro.errors import ConfigError
 from deploy.rundir import RunDir
@@ -29,7 +30,7 @@ from deploy.site import place, plan
 from deploy.site.component import gateway_of
 from sim.network.network import Host, obstacle
 
-RAW_PORT = 7448
+RAW_PORT, BARE_PORT = 7448, 7449
 PATIENCE_S = 60.0
 
 
@@ -50,15 +51,16 @@ def gateways(site: Lab) -> None:
         host.run([sys.executable, "-m", "deploy.launch", name, "--run-dir", run_dir.path], stderr=log)
 
 
-def speaker(site: Lab, host: Host, more: dict[str, Any]) -> subprocess.Popen[str]:
+def speaker(site: Lab, host: Host, more: dict[str, Any], kind: str = "") -> subprocess.Popen[str]:
     given = {
         "robot": ROBOT,
         "run": str(host.folder / "run"),
         "raw": f"tls/{site.body.address}:{RAW_PORT}",
+        "bare": f"tls/{site.body.address}:{BARE_PORT}",
         "credentials": str(site.site_of(host) / place.CREDENTIALS / host.name),
         **more,
     }
-    argv = [sys.executable, "-m", "bench.site_speaker", host.name, json.dumps(given)]
+    argv = [sys.executable, "-m", "bench.site_speaker", f"{kind}{host.name}", json.dumps(given)]
     return host.run(argv, stdout=subprocess.PIPE, text=True)
 
 
@@ -77,20 +79,25 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     with tempfile.TemporaryDirectory(prefix="site") as name, lab(Path(name)) as site:
         site.network.links().set(delay_ms=chosen.delay_ms)
         gateways(site)
+        routers = [speaker(site, host, more, ROUTER) for host in (site.body, site.brain)]
         ends = [speaker(site, host, more) for host in (site.body, site.brain)]
         for end in ends:
             said, _ = end.communicate(timeout=PATIENCE_S + seconds)
             found = json.loads(said)
             took |= {name: [ns / 1e6 for ns in times] for name, times in found.items() if times}
-    node, raw = took.get("node command", []), took.get("raw command", [])
-    if not node or not raw:
+        for router in routers:
+            router.wait(PATIENCE_S)
+    node, raw, routed = took.get(NODE, []), took.get(DIRECT, []), took.get(ROUTED, [])
+    if not node or not raw or not routed:
         raise ConfigError(f"no command came through: {', '.join(sorted(took)) or 'nothing at all'}")
     report.value("a command from host to host, Node to Node", node, "ms")
-    report.value("a command from host to host, raw zenoh over TLS", raw, "ms")
-    report.value("a command, Node to Node, 99 of 100", [high(node)], "ms")
-    report.value("a command, raw, 99 of 100", [high(raw)], "ms")
+    report.value("a command from host to host, raw zenoh over TLS, straight", raw, "ms")
+    report.value("a command from host to host, raw zenoh over TLS, bare routers", routed, "ms")
+    for way, times in (("Node to Node", node), ("raw, straight", raw), ("raw, bare routers", routed)):
+        report.value(f"a command, {way}, 99 of 100", [high(times)], "ms")
     for kind, figure in (("median", statistics.median), ("99 of 100", high)):
-        report.ratio(f"a command: Node / raw, {kind}", *_blocks(node, raw, figure), at_most=1.3)
+        report.ratio(f"a command: Node / raw over bare routers, {kind}", *_blocks(node, routed, figure), at_most=1.3)
+        report.ratio(f"a command: Node / raw, straight, {kind}", *_blocks(node, raw, figure), at_most=1.3)
     report.share("commands that came, Node to Node", len(node), commands)
 
 

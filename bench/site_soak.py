@@ -105,7 +105,8 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
         first, last = after[:part], after[-part:]
         grown[process] = max(look.rss_mb for look in last) / max(look.rss_mb for look in first)
         files = max(look.files for look in last) - max(look.files for look in first)
-        report.say(f"{process}: {last[-1].rss_mb:.0f} MB, x {grown[process]:.3f}; {last[-1].files} files, {files:+d}")
+        course = ", ".join(f"{looks[at * (len(looks) - 1) // 8].rss_mb:.0f}" for at in range(9))
+        report.say(f"{process}: {course} MB, x {grown[process]:.3f}; {last[-1].files} files, {files:+d}")
         report.value(f"open files more at the end, {process.split()[0]}", [files], "", at_most=2)
     worst = "memory at the end / after the first twelfth, the worst process"
     report.value(worst, [max(grown.values())], "x", at_most=GROWTH)

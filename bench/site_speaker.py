@@ -1,8 +1,9 @@
 """One end of the commands that `bench.site_latency` times: `python -m bench.site_speaker ROLE OPTIONS`.
 
 Role `brain` publishes wheel commands, role `body` hears them; by a Node on its host's private mesh, from where gateways
-pass them on, and by raw zenoh over TLS, straight to the other end. `OPTIONS` is one JSON object. Prints the times on
-the way as JSON.
+pass them on; by raw zenoh over TLS, straight to the other end; and by raw zenoh over a router on each host, as the
+gateways are, but without rules, limits and logs. Prints the times on the way as JSON. Roles `router-brain` and
+`router-body` are those routers. `OPTIONS` is one JSON object.
 """
 
 from __future__ import annotations
@@ -36,29 +37,53 @@ SETTLE_S = 2.0
 """From the beginning until the first message, and from the last one to the end."""
 RAW = "raw/command"
 HZ = 50.0
+NODE, DIRECT, ROUTED = "node", "direct", "routed"
+"""The ways: Node to Node over gateways; raw zenoh straight; raw zenoh over bare routers."""
+WAYS = 3
+ROUTER = "router-"
 
 
-def raw_session(role: str, options: dict[str, Any]) -> zenoh.Session:
-    """A session that meets the other end's over TLS, and nobody else."""
+def session(mode: str, options: dict[str, Any], listen: list[str], connect: list[str]) -> zenoh.Session:
+    """A session that meets these ends, and nobody else, with the credentials of its host."""
     config = zenoh.Config()
     mine = credentials.read(Path(options["credentials"]), datetime.now(UTC))
-    at = {"listen/endpoints" if role == "body" else "connect/endpoints": [options["raw"]]}
     chosen = {
-        "mode": "peer",
+        "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        **mine.options,
     }
-    for path, value in {**chosen, "listen/endpoints": [], **at, **mine.options}.items():
+    for path, value in chosen.items():
         config.insert_json5(path, json.dumps(value))
     return zenoh.open(config)
 
 
+def socket_of(options: dict[str, Any]) -> str:
+    """The end of this host's bare router for the programs on it."""
+    return f"unixsock-stream/{options['run']}/bare-router"
+
+
+async def route(host: str, options: dict[str, Any]) -> None:
+    """A bare router of one host."""
+    listen, connect = ([options["bare"]], []) if host == "body" else ([], [options["bare"]])
+    router = session("router", options, [socket_of(options), *listen], connect)
+    await asyncio.sleep(options["seconds"] + 4 * SETTLE_S)
+    router.close()  # type: ignore[no-untyped-call]
+
+
 async def speak(role: str, options: dict[str, Any]) -> dict[str, list[int]]:
-    """Sends and hears for the given times; returns the ns on the way, by way and message."""
-    took: dict[str, list[int]] = {name: [] for name in ("node command", "raw command")}
+    """Sends and hears for the given times; returns the ns on the way, by way."""
+    took: dict[str, list[int]] = {name: [] for name in (NODE, DIRECT, ROUTED)}
     clock = RealClock(0)
-    raw = raw_session(role, options)
+    there = [options["raw"]]
+    direct = session("peer", options, *((there, []) if role == "body" else ([], there)))
+    routed = session("client", options, [], [socket_of(options)])
+    raw = {DIRECT: direct, ROUTED: routed}
     run_dir = RunDir(options["robot"], Path(options["run"]))
     async with (
         await ZenohBus.open(run_dir.join_as(f"speaker-{role}")) as bus,
@@ -67,35 +92,41 @@ async def speak(role: str, options: dict[str, Any]) -> dict[str, list[int]]:
         ) as node,
     ):
 
-        def on_raw(sample: zenoh.Sample) -> None:
-            took["raw command"].append(steady_ns() - stamp(sample.payload.to_bytes()))
+        def on_raw(way: str) -> Any:
+            return lambda sample: took[way].append(steady_ns() - stamp(sample.payload.to_bytes()))
 
         if role == "body":
-            node.on(BASE_COMMAND, lambda message: took["node command"].append(clock.now_ns() - message.stamp_ns))
-            heard = raw.declare_subscriber(RAW, Callback(on_raw, indirect=False))
+            node.on(BASE_COMMAND, lambda message: took[NODE].append(clock.now_ns() - message.stamp_ns))
+            heard = [each.declare_subscriber(RAW, Callback(on_raw(way), indirect=False)) for way, each in raw.items()]
             await asyncio.sleep(options["seconds"] + 2 * SETTLE_S)
-            heard.undeclare()  # type: ignore[no-untyped-call]
+            for one in heard:
+                one.undeclare()  # type: ignore[no-untyped-call]
         else:
             commands = node.publisher(BASE_COMMAND)
-            raw_commands = raw.declare_publisher(RAW, **QOS[Qos.COMMAND])
+            publishers = [each.declare_publisher(RAW, **QOS[Qos.COMMAND]) for each in raw.values()]
             # As many bytes as the node's message has.
             size = bytes(len(encode(BaseCommand(left_mps=0.1, right_mps=0.1, stamp_ns=1 << 60, seq=1 << 15))))
             await asyncio.sleep(SETTLE_S)
             begun_s = time.monotonic()
-            for number in range(2 * options["commands"]):  # in turns, half a period apart
-                await asyncio.sleep(max(0.0, begun_s + number / (2 * HZ) - time.monotonic()))
-                if number % 2:
+            for number in range(WAYS * options["commands"]):  # in turns, a third of a period apart
+                await asyncio.sleep(max(0.0, begun_s + number / (WAYS * HZ) - time.monotonic()))
+                way = number % WAYS
+                if way == len(publishers):
                     commands.put(BaseCommand(left_mps=0.1, right_mps=0.1))
                 else:
-                    raw_commands.put(stamped(size))
+                    publishers[way].put(stamped(size))
             await asyncio.sleep(SETTLE_S)
-    raw.close()  # type: ignore[no-untyped-call]
+    for each in raw.values():
+        each.close()  # type: ignore[no-untyped-call]
     return took
 
 
 def main() -> None:
     role, options = sys.argv[1], json.loads(sys.argv[2])
     with asyncio.Runner(loop_factory=LendingLoop) as runner:
+        if role.startswith(ROUTER):
+            runner.run(route(role.removeprefix(ROUTER), options))
+            return
         print(json.dumps(runner.run(speak(role, options))), flush=True)
 
 

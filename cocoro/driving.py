@@ -110,6 +110,7 @@ class Driving:
             self.reply = await self._participant.call(DRIVE, request)
             self.trouble = ""
         except CocoroError as error:
-            self.reply, self.trouble = DriveReply(accepted=False), str(error)
+            # The old tick moves nothing any more, but shows who asks.
+            self.reply, self.trouble = DriveReply(accepted=False, tick=self.reply.tick), str(error)
         if self.reply.refusal == "no_task":
             self.over.set()

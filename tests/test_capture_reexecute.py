@@ -89,19 +89,20 @@ def test_the_first_difference_is_told_with_its_place_and_size(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nudge(seen: Detections) -> None:
-        seen.detections[0].u_px += 0.25
+        seen.detections[0].u_px += 2.5
 
     make = perception.core
     use_core(monkeypatch, perception, lambda *args: Changed(make(*args), nudge, Detections, 20))
-    result = again(GOLDEN, "perception")
+    result = again(GOLDEN, "perception", TOLERANCE)
     assert (result.differing, result.not_executable) == (1, 0)
     assert result.equal == result.steps - 1
     assert result.first is not None
     assert result.first.text.startswith("perception/detections: detections[0].u_px was ")
-    assert result.first.text.endswith("by 0.25")
+    assert result.first.text.endswith("by 2.5")
     assert not result.first.after_missing
     assert again(GOLDEN, "perception", 0.1).differing == 0
-    assert main(["capture", "reexecute", str(GOLDEN), "--service", "perception"]) == 1
+    arguments = ["capture", "reexecute", str(GOLDEN), "--service", "perception", "--tolerance", str(TOLERANCE)]
+    assert main(arguments) == 1
     assert "1 steps differ" in capsys.readouterr().out
 
 

@@ -33,8 +33,8 @@ class TaskState(Message):
     phases: tuple[Phase, ...] = ()
     outcome: Outcome | None = None
     reason: str = ""
-    """For failed and cancelled tasks: a word (not_found, lost, slipped, unreachable, timed_out, ...), a colon, and a
-    sentence."""
+    """For failed and cancelled tasks, and where it needs one for a task that is done: a word (not_found, lost, slipped,
+    unreachable, timed_out, ...), a colon, and a sentence."""
     elapsed_s: Finite = 0.0
     measures: dict[str, Finite] = {}
     """The task's own figures on how well it goes, by name; which ones is said where the task is described."""

@@ -113,9 +113,10 @@ class ArmController:
         dt_s: float,
         *,
         swing_radps: float | None = None,
+        roll_rad: float | None = None,
     ) -> ArmStep:
         """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first. It swings to the
-        front at `swing_radps` or, by default, as fast as it may."""
+        front at `swing_radps` or, by default, as fast as it may. `roll_rad`: the wrist's at the pose; None: level."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
@@ -131,7 +132,7 @@ class ArmController:
             stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
-            return self._cartesian(goal, speed_mps, dt_s)
+            return self._cartesian(goal, speed_mps, dt_s, roll_rad)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
         return self._joints(stage, dt_s, swing_radps if "arm_base" in stage else None)._replace(
             arrived=False, left=left_m
@@ -180,7 +181,7 @@ class ArmController:
             trial[name] += scale * gap
         return self._commit(trial, widest * (1 - scale), dt_s, arrived=widest * (1 - scale) < 0.02)
 
-    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> ArmStep:
+    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float, roll_rad: float | None = None) -> ArmStep:
         assert self._reference is not None
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
@@ -190,7 +191,7 @@ class ArmController:
         for name in ARM:
             change = trial[name] - self._reference[name]
             trial[name] = self._reference[name] + min(max(change, -limit), limit)
-        roll_gap = self._roll_rad - self._reference[ROLL]
+        roll_gap = (self._roll_rad if roll_rad is None else roll_rad) - self._reference[ROLL]
         trial[ROLL] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
