@@ -10,10 +10,10 @@ their modules, such as `cocoro.component`. Names that are not listed here are in
 - Messages: `Topic` and `Request` declare what travels; `Message` is the base of every published message, `Qos` the
   quality of service of a key, `Bus` the interface to the mesh. `Latest` and `Stream` read a topic's `Inbox`, and a
   `Publisher` publishes on one topic.
-- A client: `connect` and `connect_blocking` operate a robot from a program, `open` reads a capture as arrays
-  (docs/client.md). They are applications' and lent to this package: `from cocoro import *` leaves them out. A task that
-  a robot refuses is a `TaskRefusedError` of its own kind, one that is not done a `TaskEndedError`; `Motion` drives by
-  hand.
+- A client: `connect` and `connect_blocking` operate a robot from a program, `rehearse` tries the program on a
+  simulated one in virtual time, `open` reads a capture as arrays (docs/client.md). They are lent to this package by the
+  applications, and `from cocoro import *` leaves them out. A task that a robot refuses is a `TaskRefusedError` of its
+  own kind, one that is not done a `TaskEndedError`; `Motion` drives by hand.
 - A task: `Task` and `Skills`, `Action` for the planner, `TaskFailedError` to end it as failed.
 - Time: `Clock` and its kinds, `is_fresh` for ages, `every` for loops, `NS` nanoseconds per second; `run_virtual` runs a
   coroutine in virtual time.
@@ -45,6 +45,7 @@ _LENT = {
     "connect": "apps.client.connecting",
     "connect_blocking": "apps.client.blocking",
     "open": "apps.client.opening",
+    "rehearse": "apps.client.rehearsing",
 }
 """Names of applications that a user finds here, by module. They are imported by name when they are used first: nothing
 of this package imports what stands above it. Type checkers see all names in `__init__.pyi`."""

@@ -3,6 +3,7 @@
 from apps.client.blocking import connect_blocking as connect_blocking
 from apps.client.connecting import connect as connect
 from apps.client.opening import open as open
+from apps.client.rehearsing import rehearse as rehearse
 from cocoro.api import *
 
 __all__: list[str]

@@ -33,6 +33,8 @@ class TaskResult(msgspec.Struct, frozen=True, kw_only=True):
     phases: tuple[Phase, ...]
     measures: dict[str, float]
     """The task's own figures on how well it went, by name."""
+    reason: str
+    """What the task says of its end, a word, a colon and a sentence; '' for most."""
     recorded_in: str
     """The capture's file on the robot's computer; '' when no recorder has told."""
 
@@ -214,7 +216,7 @@ class TaskHandle(Watcher):
             raise ending(state)
         return TaskResult(
             task_id=state.task_id, task=state.task, label=state.label, elapsed_s=state.elapsed_s, phases=state.phases,
-            measures=state.measures, recorded_in=self._run.file,
+            measures=state.measures, reason=state.reason, recorded_in=self._run.file,
         )  # fmt: skip
 
     @property

@@ -11,6 +11,7 @@ from cocoro.messages import BaseState, Health, Latch, Message, PlannerStatus, Ta
 from cocoro.participant import Participant
 from cocoro.topics import ANY, BASE_STATE, HEALTH, LATCH, PLAN, TASK
 
+EXECUTIVE = "executive"
 ANSWER_S = 1.0
 """Longest wait for a service's newest message; a service that is late counts as silent."""
 
@@ -30,10 +31,11 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def ready(self) -> bool:
-        """Whether no task runs, the emergency stop is released, and no service reports trouble."""
+        """Whether no task runs, the emergency stop is released, and no service that is alive reports trouble."""
         free = self.task is None or not self.task.task_id or self.task.outcome is not None
         released = self.latch is not None and self.latch.state == "released"
-        return free and released and all(health.state == "ready" for health in self.health.values())
+        well = all(service in self.health and self.health[service].state == "ready" for service in self.alive)
+        return free and released and well and EXECUTIVE in self.alive
 
 
 async def status(participant: Participant) -> RobotStatus:
