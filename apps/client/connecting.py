@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import cache, partial
+from functools import partial
 
 from apps.client.choice import RobotChoice
 from apps.client.link import joined
@@ -47,7 +47,7 @@ async def connect(
     async with joined(RobotChoice(robot, site), frames=True) as link:
         contact = ProcessContact(link.run_dir.claimant_pid, SleepDetector())
         path = partial(_by_path, link.robot) if link.here else None
-        async with RobotClient(link, contact=contact, described=cache(link.described), stop_path=path) as client:
+        async with RobotClient(link, contact=contact, described=link.described, stop_path=path) as client:
             yield client
 
 

@@ -56,6 +56,7 @@ class RobotClient:
         self._stop_path = stop_path
         self._by = by
         self._handles: list[TaskHandle] = []
+        self._description: Robot | None = None
 
     @property
     def name(self) -> str:
@@ -157,7 +158,10 @@ class RobotClient:
         pairs = seeing.FramePairs(self.participant)
         pairs.open()
         frame, seen = await pairs.take(detections_s=seeing.DETECTIONS_S if detections else 0.0)
-        return View(frame, seen, await asyncio.to_thread(self._described))
+        if self._description is None:
+            virtual = self.participant.clock.virtual  # there no thread can be waited for
+            self._description = self._described() if virtual else await asyncio.to_thread(self._described)
+        return View(frame, seen, self._description)
 
     async def objects(self) -> tuple[KnownObject, ...]:
         """The objects that the robot knows, and where it saw each last."""
