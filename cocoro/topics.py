@@ -262,7 +262,7 @@ CANCEL = Request(
 DRIVE = Request(
     "executive/drive", m.DriveRequest, m.DriveReply,
     "One input of an operator who drives by hand; it moves the robot for at most 0.2 s.",
-    timeout_s=0.5,
+    timeout_s=0.5, most_hz=100.0,
 )  # fmt: skip
 REPORT = Request(
     "executive/report", m.ReportRequest, m.TaskState,
