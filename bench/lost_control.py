@@ -1,10 +1,10 @@
 """Measures how soon a robot that is driven by hand stands when its driver is lost: `python -m bench lost-control`.
 
-A robot of processes (profile `sim`, real sensors) is driven at full speed by a program. At a random moment the program
-is killed or stopped, freezes, or lets go; or the executive is killed or stopped, or the emergency stop is pressed. The
-time counts from when the last request was sent whose motion was accepted, until the body stands for good by the
-simulator's record of each physics step. It must be at rest within 0.45 s, and a wheel command of zero must come within
-0.3 s.
+A robot of processes (profile `sim`, real sensors) is driven at full speed by a program, or by a page over the cockpit's
+WebSocket. At a random moment that is killed or stopped, freezes, or lets go; or the executive or the cockpit is killed
+or stopped, or the emergency stop is pressed. The time counts from when the last request was sent whose motion was
+accepted, until the body stands for good by the simulator's record of each physics step. It must be at rest within
+0.45 s, and a wheel command of zero must come within 0.3 s.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -40,7 +41,7 @@ FAST_SHARE = 0.93
 """Share of the full speed at which a trial may begin: real wheels slip a little."""
 PATIENCE_S = 40.0
 WATCH_S = 1.2
-TRIALS = 14
+TRIALS = 13
 """Trials with one robot."""
 SCENE = """\
 name = "lost-control"
@@ -57,10 +58,12 @@ position_m = [0.0, 2.5]
 class Driver:
     """The program that drives. `sent` is the file of the times at which it sent what was accepted."""
 
-    def __init__(self, cocoro: Operator, sent: Path) -> None:
+    def __init__(self, cocoro: Operator, sent: Path, port: int | None) -> None:
+        """`port`: of the cockpit, for a page that drives."""
         self._sent = sent
         sent.write_bytes(b"")
-        command = [sys.executable, "-m", "bench.lost_control_driver", NAME, str(sent)]
+        which = ("bench.lost_control_driver", NAME) if port is None else ("bench.lost_control_page", str(port))
+        command = [sys.executable, "-m", *which, str(sent)]
         self._process = subprocess.Popen(
             command, env=cocoro.environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -98,9 +101,9 @@ class Trial(NamedTuple):
     """Simulated time until the first wheel command of zero after which no other came."""
 
 
-def _service(number: signal.Signals) -> Callable[[LiveRobot, Driver], None]:
+def _service(number: signal.Signals, service: str = "executive") -> Callable[[LiveRobot, Driver], None]:
     def send(robot: LiveRobot, driver: Driver) -> None:
-        target = Target(robot.cocoro.run_dir.path / "claims" / "executive")
+        target = Target(robot.cocoro.run_dir.path / "claims" / service)
         target.signal(number)
         target.close()
 
@@ -119,6 +122,12 @@ LOSSES: dict[str, Callable[[LiveRobot, Driver], None]] = {
     "executive killed": _service(signal.SIGKILL),
     "executive stopped": _service(signal.SIGSTOP),
     "emergency stop": _stop,
+    "page killed": lambda robot, driver: driver.signal(signal.SIGKILL),
+    "page stopped": lambda robot, driver: driver.signal(signal.SIGSTOP),
+    "page frozen": lambda robot, driver: driver.say("freeze"),
+    "page lets go": lambda robot, driver: driver.say("let-go"),
+    "page, cockpit killed": _service(signal.SIGKILL, "cockpit"),
+    "page, cockpit stopped": _service(signal.SIGSTOP, "cockpit"),
 }
 
 
@@ -139,7 +148,7 @@ async def _trial(robot: LiveRobot, what: str, sent: Path, rng: random.Random) ->
     """One loss. Raises TimeoutError when the robot never drives fast."""
     commands: list[BaseCommand] = []
     robot.node.on(topics.BASE_COMMAND, commands.append)
-    driver = Driver(robot.cocoro, sent)
+    driver = Driver(robot.cocoro, sent, await _port(robot) if what.startswith("page") else None)
     try:
         speed_mps = await _fast(robot, driver, rng)
         LOSSES[what](robot, driver)
@@ -160,12 +169,22 @@ async def _trial(robot: LiveRobot, what: str, sent: Path, rng: random.Random) ->
     )  # fmt: skip
 
 
+async def _port(robot: LiveRobot) -> int:
+    """Where the cockpit's page is."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            for health in await robot.node.newest(topics.HEALTH.of("cockpit"), 1.0):
+                if found := re.search(r":(\d+)/", health.text):
+                    return int(found[1])
+            await asyncio.sleep(0.2)
+
+
 async def _ready_again(robot: LiveRobot, what: str) -> None:
     """Bring the robot back to where it takes a task."""
     if what == "emergency stop":
         with suppress(CocoroError):
             await robot.node.call_all(topics.RESET.of("*"), ResetRequest(by="bench"))
-    if what.startswith("executive"):
+    if what.startswith("executive") or "cockpit" in what:
         await asyncio.sleep(4.0)  # the supervisor kills what stands still, and starts it anew
 
 
@@ -176,7 +195,7 @@ async def _robot(numbers: range, chosen: argparse.Namespace, report: Report) -> 
     with operator() as cocoro, tempfile.TemporaryDirectory(prefix="lost") as folder:
         scene = Path(folder) / "scene.toml"
         scene.write_text(SCENE)
-        async with robot_up(cocoro, "sim", str(scene), Path(folder)) as robot:
+        async with robot_up(cocoro, "sim", str(scene), Path(folder), "service.cockpit.port=0") as robot:
             for number in numbers:
                 what = names[number % len(names)]
                 rng = random.Random(f"lost/{chosen.seed}/{number}")
@@ -196,12 +215,12 @@ async def _robot(numbers: range, chosen: argparse.Namespace, report: Report) -> 
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--count", type=number_of, help=f"losses, by turns of {len(LOSSES)} kinds (21)")
+    parser.add_argument("--count", type=number_of, help=f"losses, by turns of {len(LOSSES)} kinds (26)")
     parser.add_argument("--seed", type=int, default=0)
 
 
 def measure(chosen: argparse.Namespace, report: Report) -> None:
-    count = sized(chosen, chosen.count, 21, 2)
+    count = sized(chosen, chosen.count, 26, 2)
     trials: list[Trial] = []
     for first in range(0, count, TRIALS):
         trials += asyncio.run(_robot(range(first, min(first + TRIALS, count)), chosen, report))

@@ -42,7 +42,7 @@ def opened(browser: Browser, url: str, size: str = "desk", **options: Any) -> It
     try:
         page = context.new_page()
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda told: told.type == "error" and complaints.append(told.text))
+        page.on("console", lambda told: complaints.extend([told.text] if told.type == "error" else []))
         page.goto(url)
         page.wait_for_selector("#link-state[data-state=live]")
         page.wait_for_selector("#open-health[data-state]")

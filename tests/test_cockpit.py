@@ -363,6 +363,27 @@ async def test_a_page_that_drives_quotes_the_ticks_itself(tmp_path: Path) -> Non
 
 
 @in_virtual_time
+async def test_a_page_that_goes_ends_the_drive_that_it_began(tmp_path: Path) -> None:
+    async with cockpit(tmp_path) as rig:
+        ended: list[str] = []
+
+        async def run(_: TaskRequest) -> TaskReply:
+            return TaskReply(accepted=True, task_id="drive-1")
+
+        async def cancel(request: CancelRequest) -> TaskReply:
+            ended.append(request.task_id)
+            return TaskReply(accepted=True, task_id=request.task_id)
+
+        rig.service.serve(RUN, run)
+        rig.service.serve(CANCEL, cancel)
+        async with rig.page() as page, rig.page():
+            assert (await page.asks("begin-drive"))["ok"]
+            assert ended == []
+        await rig.service.advance(0.1)
+        assert ended == ["drive-1"]
+
+
+@in_virtual_time
 async def test_motions_that_wait_are_replaced_by_the_newest(tmp_path: Path) -> None:
     async with cockpit(tmp_path) as rig, rig.page() as page:
         asked: list[float] = []
