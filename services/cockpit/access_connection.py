@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Protocol, cast
 
 from services.cockpit.access_limits import Bucket, DoorLimits
 from services.cockpit.access_peer import Address
-
-if TYPE_CHECKING:
-    from services.cockpit.access_door import Door
 
 PIECE = 4096
 """Bytes that are parsed before the loop does something else."""
 
 
+class Doorkeeper(Protocol):
+    """What a connection knows of the door that has taken it."""
+
+    loop: asyncio.AbstractEventLoop
+    limits: DoorLimits
+    swept_s: float
+    """Time by the door's sweeps: it stands while this process does, which is no client's fault."""
+
+    def left(self, connection: Connection) -> None:
+        """A connection has ended."""
+
+
 class Connection(asyncio.Protocol):
     """A connection that was taken: stands between the transport and the server's protocol, and counts."""
 
-    def __init__(self, door: Door, address: Address, key: str, user: int | None, inner: asyncio.Protocol) -> None:
+    def __init__(self, door: Doorkeeper, address: Address, key: str, user: int | None, inner: asyncio.Protocol) -> None:
         self.address, self.key, self.user = address, key, user
         self.requests = 0
         """That have begun."""
