@@ -73,7 +73,10 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     (folder / "far.toml").write_text(SCENE)
     # STOP reaches all robots of a name on this machine: this one has its own.
     life = live(folder, name="seen", scene=folder / "far.toml", also=("capture", "cockpit"), mesh=ANY_PORT)
-    robot = asyncio.run_coroutine_threadsafe(life.__aenter__(), loop).result()
+    (folder / "state").mkdir(mode=0o700)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COCORO_STATE_DIR", str(folder / "state"))
+        robot = asyncio.run_coroutine_threadsafe(life.__aenter__(), loop).result()
     try:
         yield Beside(loop, robot)
     finally:

@@ -164,12 +164,24 @@ function openPanel(name) {
     button.setAttribute("aria-expanded", String(open));
     if (!open) continue;
     const close = make("button", { type: "button", class: "round", "aria-label": say("close"), onclick: () => openPanel(null) }, "✕");
-    the(each).replaceChildren(make("header", {}, make("h2", {}, say(`${each}.title`)), each === "log" ? logChoice() : "", close));
+    const extra = { log: () => [logChoice()], health: personal, captures: () => [] }[each]();
+    the(each).replaceChildren(make("header", {}, make("h2", {}, say(`${each}.title`)), ...extra, close));
     delete the(each).dataset.seen;
     if (each === "captures") captures.open();
     close.focus();
   }
   live.send({ do: "log", on: name === "log" && !the("log").hidden });
+}
+
+/** What belongs to the person: the language, for a head that has no room for it, and the end of a session. */
+function personal() {
+  const language = make("button", { type: "button", class: "plain", onclick: () => the("language").click() }, say("language"));
+  const logOut = async () => {
+    await fetch("/logout", { method: "POST", redirect: "manual" });
+    location.assign("/login");
+  };
+  const end = make("button", { type: "button", class: "plain", onclick: logOut }, say("log_out"));
+  return location.protocol === "https:" ? [language, end] : [language];
 }
 
 for (const name of PANELS) the(`open-${name}`).addEventListener("click", () => openPanel(name));
