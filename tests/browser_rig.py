@@ -20,13 +20,13 @@ SIZES = {"phone": (360, 640), "desk": (1280, 800), "wall": (3840, 2160)}
 
 
 @contextmanager
-def browser() -> Iterator[Browser]:
+def browser(*flags: str) -> Iterator[Browser]:
     """A browser; the test is skipped where there is none."""
     program = shutil.which(CHROMIUM)
     if program is None:
         pytest.skip(f"SKIPPED, NOT PROVEN HERE: there is no {CHROMIUM}; on Debian `apt-get install chromium` brings it")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=program, args=FLAGS)
+        started = playwright.chromium.launch(executable_path=program, args=[*FLAGS, *flags])
         try:
             yield started
         finally:
@@ -42,7 +42,7 @@ def opened(browser: Browser, url: str, size: str = "desk", **options: Any) -> It
     try:
         page = context.new_page()
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda told: told.type == "error" and complaints.append(told.text))
+        page.on("console", lambda told: complaints.extend([told.text] if told.type == "error" else []))
         page.goto(url)
         page.wait_for_selector("#link-state[data-state=live]")
         page.wait_for_selector("#open-health[data-state]")

@@ -176,10 +176,11 @@ async def served(
     certificates: Certificates | None = None,
     door_limits: DoorLimits | None = None,
     gate_limits: GateLimits | None = None,
+    echo: Echo | None = None,
 ) -> AsyncIterator[Open]:
     """The small application behind gate and door, at a free port of 127.0.0.1."""
     entrance = entrance or Entrance("127.0.0.1", False, LOOPBACK_NAMES)
-    audit, echo = Heard(asyncio.get_running_loop().time), Echo()
+    audit, echo = Heard(asyncio.get_running_loop().time), echo or Echo()
     gate = Gate(
         names=entrance.names, tls=entrance.served is not None, people=people, certificates=certificates,
         limits=gate_limits, audit=audit, door_limits=door_limits,

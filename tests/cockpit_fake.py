@@ -134,8 +134,10 @@ class Viewer:
                 stamp_ns = time.time_ns()
                 self.fake.stamps.append(stamp_ns)
                 marks, jpeg = self.fake.world.picture()
-                header = {"stamp_ns": stamp_ns, "now_ns": time.time_ns(), "width": WIDTH, "height": HEIGHT}
-                header |= {"level": "1/80", "marks": marks}
+                header = {
+                    "stamp_ns": stamp_ns, "now_ns": time.time_ns(), "width": WIDTH, "height": HEIGHT,
+                    "level": "1/80", "marks": marks,
+                }  # fmt: skip
                 text = json.dumps(header).encode()
                 await self.socket.send_bytes(struct.pack("<I", len(text)) + text + jpeg)
             await asyncio.sleep(1 / FPS)

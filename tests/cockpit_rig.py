@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, MutableMapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,8 @@ from cocoro.node import Node
 from cocoro.task_table import described
 from cocoro.testing import ServiceUnderTest
 from cocoro.topics import OBJECTS, TASKS
-from services.cockpit.access import Gate, Role, Visitor
+from services.cockpit.access import Gate, Visitor
+from services.cockpit.access_rules import Role
 from services.cockpit.app import App
 from services.cockpit.cockpit import Cockpit
 from services.cockpit.config import CockpitConfig
@@ -156,10 +157,10 @@ class CockpitRig:
             "headers": [(b"host", b"127.0.0.1:8770")], "client": HERE, "scheme": "http", "root_path": "",
             "http_version": "1.1",
         }  # fmt: skip
-        asked = [{"type": "http.request", "body": body, "more_body": False}]
+        asked: list[MutableMapping[str, Any]] = [{"type": "http.request", "body": body, "more_body": False}]
         answers: list[Mapping[str, Any]] = []
 
-        async def receive() -> Mapping[str, Any]:
+        async def receive() -> MutableMapping[str, Any]:
             if asked:
                 return asked.pop()
             return await asyncio.get_running_loop().create_future()  # type: ignore[no-any-return] # never comes

@@ -28,7 +28,7 @@ from cocoro.messages import (
     TaskRequest,
     TaskState,
 )
-from cocoro.testing import in_virtual_time
+from cocoro.testing import in_virtual_time, misdeclared
 from cocoro.topics import (
     BASE_STATE,
     CANCEL,
@@ -40,7 +40,9 @@ from cocoro.topics import (
     RESET,
     RUN,
     TASK,
+    TOPICS,
 )
+from services.cockpit.component import COCKPIT
 
 BASE = BaseState(odometry_m=(0.0, 0.0), odometry_yaw_rad=0.0, speed_mps=0.2, turn_rate_radps=0.0, bump_left=True)
 
@@ -361,6 +363,27 @@ async def test_a_page_that_drives_quotes_the_ticks_itself(tmp_path: Path) -> Non
 
 
 @in_virtual_time
+async def test_a_page_that_goes_ends_the_drive_that_it_began(tmp_path: Path) -> None:
+    async with cockpit(tmp_path) as rig:
+        ended: list[str] = []
+
+        async def run(_: TaskRequest) -> TaskReply:
+            return TaskReply(accepted=True, task_id="drive-1")
+
+        async def cancel(request: CancelRequest) -> TaskReply:
+            ended.append(request.task_id)
+            return TaskReply(accepted=True, task_id=request.task_id)
+
+        rig.service.serve(RUN, run)
+        rig.service.serve(CANCEL, cancel)
+        async with rig.page() as page, rig.page():
+            assert (await page.asks("begin-drive"))["ok"]
+            assert ended == []
+        await rig.service.advance(0.1)
+        assert ended == ["drive-1"]
+
+
+@in_virtual_time
 async def test_motions_that_wait_are_replaced_by_the_newest(tmp_path: Path) -> None:
     async with cockpit(tmp_path) as rig, rig.page() as page:
         asked: list[float] = []
@@ -402,3 +425,24 @@ async def test_a_click_on_the_map_names_the_object_there_or_the_place(tmp_path: 
         reply = await page.asks("what", map=[0.2, -0.4])
         assert (reply["data"]["label"], reply["data"]["place"]) == (None, [0.2, -0.4])
         assert not (await page.asks("what"))["ok"]
+
+
+# --- what it declares -----------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_it_speaks_as_it_declares(tmp_path: Path) -> None:
+    async with cockpit(tmp_path) as rig, rig.page() as page:
+        stoppable(rig)
+        await rig.service.advance(0.5)
+        rig.service.feed(TASK, TaskState(task_id="drive-1", task="drive", phase="drive"))
+        await rig.service.advance(0.1)
+        await page.asks("run", task={"task": "park"})
+        await page.asks("cancel")
+        await page.asks("reset")
+        await page.asks("stop")
+        page.say("drive", tick=0)
+        await rig.request("GET", "/captures")
+        await rig.service.advance(1.0)
+        rig.service.bus.calls -= {topic.of("*").name if topic.per_service else topic.name for topic in TOPICS}  # newest
+        assert misdeclared(COCKPIT, rig.service.bus) == []

@@ -23,7 +23,7 @@ from services.cockpit.access_peer import Peers
 
 LIMIT_S = 60.0
 PLENTY = Rate(1e6, 1e6)
-QUICK = DoorLimits(first_s=0.2, idle_s=0.4, stalled_s=0.3, overfed_s=0.3, takes=PLENTY, takes_all=PLENTY)
+QUICK = DoorLimits(first_s=0.6, idle_s=0.6, stalled_s=0.6, overfed_s=0.6, takes=PLENTY, takes_all=PLENTY)
 """Limits that a test need not wait for."""
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 
@@ -194,20 +194,17 @@ async def test_new_connections_beyond_the_rate_are_refused_and_pages_are_served(
 @in_real_time
 async def test_a_reader_that_takes_nothing_is_ended() -> None:
     async with served(door_limits=QUICK) as cockpit:
-        page = socket.socket()
-        page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        page.setblocking(False)
-        loop = asyncio.get_running_loop()
-        await loop.sock_connect(page, ("127.0.0.1", cockpit.port))
-        upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
-        await loop.sock_sendall(page, request(cockpit, "/live", more=upgrade + key))
-        for _ in range(30):
-            text = b"send 1000000"
-            await loop.sock_sendall(page, bytes([0x81, 0x80 | len(text)]) + bytes(4) + text)
-        await until(lambda: cockpit.audit.has("it takes nothing"))
-        assert not cockpit.taken()
-        page.close()
+        with socket.socket() as page:
+            page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            page.setblocking(False)
+            loop = asyncio.get_running_loop()
+            await loop.sock_connect(page, ("127.0.0.1", cockpit.port))
+            await loop.sock_sendall(page, upgrade(cockpit))
+            for _ in range(30):
+                text = b"send 1000000"
+                await loop.sock_sendall(page, bytes([0x81, 0x80 | len(text)]) + bytes(4) + text)
+            await until(lambda: cockpit.audit.has("it takes nothing"))
+            await until(lambda: not cockpit.taken())
 
 
 @in_real_time
@@ -227,9 +224,14 @@ async def test_a_client_that_sends_without_end_is_read_slowly_and_ended() -> Non
 
 async def open_page(cockpit: Open, client: Client) -> None:
     """Opens a socket on a connection."""
-    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-    client.writer.write(request(cockpit, "/live", more=f"{upgrade}Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"))
+    client.writer.write(upgrade(cockpit))
     assert b" 101 " in await client.reader.readuntil(b"\r\n\r\n")
+
+
+def upgrade(cockpit: Open) -> bytes:
+    """The request that opens a socket."""
+    more = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    return request(cockpit, "/live", more=f"{more}Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n")
 
 
 FRAMES = {
@@ -252,7 +254,7 @@ FRAMES = {
 @pytest.mark.parametrize("what", FRAMES)
 @in_real_time
 async def test_a_malformed_frame_ends_its_socket_with_a_reason(what: str) -> None:
-    async with served(door_limits=QUICK._replace(idle_s=1.0)) as cockpit:
+    async with served(door_limits=QUICK) as cockpit:
         client = await Client.to(cockpit)
         await open_page(cockpit, client)
         answer = await client(FRAMES[what])

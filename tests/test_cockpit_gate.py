@@ -9,6 +9,7 @@ from cocoro.testing import in_virtual_time
 from services.cockpit import access_rules as rules
 from services.cockpit.access import GateLimits, Message, Receive, Send, Visitor
 from services.cockpit.access_limits import Rate
+from services.cockpit.access_passage import Passage
 from services.cockpit.access_rules import Scope
 
 OWN = ("Origin", f"http://{HOST}")
@@ -25,7 +26,7 @@ class Rig:
         self.gate = Fixed(audit=self.audit, limits=limits, clock=lambda: self.now_s)
         self.gate.visitor = visitor
         self.echo = Echo()
-        self.app = self.gate.app(self.echo)
+        self.app = Passage(self.gate, self.echo)
 
     async def refused(self, status: int, what: str, *given: object, **more: object) -> Answer:
         """Asks, and checks that it is refused, that the log says so, and that the service never saw it."""
@@ -257,7 +258,7 @@ async def test_requests_beyond_a_visitors_budget_are_refused_until_time_has_pass
 
 @in_virtual_time
 async def test_a_stop_has_a_budget_of_its_own() -> None:
-    rig = Rig(GateLimits(requests=Rate(1.0, 1.0), requests_all=Rate(1.0, 1.0), stops=Rate(1.0, 2.0)))
+    rig = Rig(GateLimits(requests=Rate(1.0, 1.0), stops=Rate(1.0, 2.0)))
     for _ in range(5):
         await ask(rig.app, head())
     for status in (200, 200, 429):
@@ -266,10 +267,33 @@ async def test_a_stop_has_a_budget_of_its_own() -> None:
 
 @in_virtual_time
 async def test_one_address_does_not_use_up_anothers_budget() -> None:
-    rig = Rig(GateLimits(requests=Rate(1.0, 1.0)))
-    for _ in range(5):
-        await ask(rig.app, head(client=("10.0.0.5", 1)))
-    assert (await ask(rig.app, head(client=("10.0.0.6", 1)))).status == 200
+    rig = Rig(GateLimits(requests=Rate(1.0, 1.0)), visitor=None)
+    for status in (401, 429, 429):
+        assert (await ask(rig.app, head(client=("10.0.0.5", 1)))).status == status
+    assert (await ask(rig.app, head(client=("10.0.0.6", 1)))).status == 401
+
+
+@in_virtual_time
+async def test_those_who_are_nobody_use_up_no_visitors_budget() -> None:
+    rig = Rig(visitor=None)
+    statuses = {(await ask(rig.app, head(client=(f"10.0.0.{number}", 1)))).status for number in range(200)}
+    assert statuses == {401, 503}
+    rig.gate.visitor = VIEWER
+    assert (await ask(rig.app, head())).status == 200
+
+
+@in_virtual_time
+async def test_stops_that_a_foreign_page_sends_use_up_nobodys_budget() -> None:
+    rig = Rig()
+    for _ in range(100):
+        await ask(rig.app, head("POST", "/stop", [("Origin", "http://evil.example")]))
+    assert (await ask(rig.app, head("POST", "/stop", [OWN]))).status == 200
+
+
+@in_virtual_time
+async def test_a_stop_is_one_whatever_comes_with_it() -> None:
+    rows = [OWN, ("Content-Type", "text/plain"), ("Content-Length", "4")]
+    assert (await ask(Rig().app, head("POST", "/stop", rows), b"stop")).status == 200
 
 
 @in_virtual_time
@@ -345,7 +369,7 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 async def test_a_socket_ends_with_its_visitors_session() -> None:
     rig = Rig(visitor=VIEWER)
 
-    app = rig.gate.app(rig.echo)
+    app = Passage(rig.gate, rig.echo)
 
     async def hurrying(scope: Scope, receive: Receive, send: Send) -> None:
         async def later() -> Message:

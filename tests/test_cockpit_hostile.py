@@ -15,6 +15,7 @@ from cocoro.testing import in_virtual_time
 from cocoro.topics import CANCEL, DRIVE, RESET, RUN
 from services.cockpit import orders
 from services.cockpit.access import Visitor
+from services.cockpit.access_passage import Passage
 
 OPERATING: dict[str, dict[str, Any]] = {
     "run": {"id": 1, "task": {"task": "park"}},
@@ -139,7 +140,7 @@ async def test_no_name_of_a_capture_leads_elsewhere(name: str, gated: bool, shor
     async with cockpit(folder) as rig:
         gate = Fixed()
         gate.visitor = Visitor("owner", "operator")
-        app = gate.app(rig.app.asgi) if gated else rig.app.asgi
+        app = Passage(gate, rig.app.asgi) if gated else rig.app.asgi
         for method, path in WAYS:
             for written in (quote(name, safe="%"), quote(name, safe="/%")):
                 scope = head(method, path.format(written), [("Origin", "http://127.0.0.1:8770")])

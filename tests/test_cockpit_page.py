@@ -321,7 +321,10 @@ def test_two_thumbs_drive_and_look_at_once_on_a_phone(chromium: Browser, fake: F
         page.wait_for_selector(DRIVING)
         points = [middle_of(page, "#stick-base"), middle_of(page, "#stick-part")]
         devices = page.context.new_cdp_session(page)
-        touch = lambda kind, at: devices.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})  # noqa: E731
+
+        def touch(kind: str, at: list[dict[str, float]]) -> None:
+            devices.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
         touch("touchStart", [{"x": x, "y": y, "id": index} for index, (x, y) in enumerate(points)])
         (x, y), (u, v) = points
         touch("touchMove", [{"x": x, "y": y - 60, "id": 0}, {"x": u + 60, "y": v, "id": 1}])

@@ -12,7 +12,7 @@ import pytest
 from cockpit_rig import CockpitRig, Page, cockpit
 
 from cocoro.clock import NS
-from cocoro.messages import Detection, Detections, PlannerStatus, ServoState
+from cocoro.messages import Detection, Detections, Frame, PlannerStatus, ServoState
 from cocoro.testing import in_virtual_time
 from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, PLAN
 from services.cockpit import pictures
@@ -34,7 +34,12 @@ async def film(rig: CockpitRig, seconds: float, each: Callable[[], object] = lam
 def encodings_counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Level]]:
     done: list[Level] = []
     real = pictures.encode
-    monkeypatch.setattr(pictures, "encode", lambda frame, level: done.append(level) or real(frame, level))
+
+    def counted(frame: Frame, level: Level) -> bytes:
+        done.append(level)
+        return real(frame, level)
+
+    monkeypatch.setattr(pictures, "encode", counted)
     yield done
 
 

@@ -19,6 +19,7 @@ from deploy.site import authority
 from services.cockpit.access import COOKIE, GateLimits
 from services.cockpit.access_certificates import SiteCertificates
 from services.cockpit.access_limits import Rate
+from services.cockpit.access_passage import Passage
 from services.cockpit.access_people import People, spaced
 from services.cockpit.access_tls import Entrance, entrance
 from services.cockpit.config import CockpitConfig
@@ -325,7 +326,7 @@ async def test_no_one_logs_in_where_nothing_is_encrypted(short_path: Path) -> No
 
         scope = head(headers=[("Cookie", f"{COOKIE}={token}")], client=("10.0.0.5", 1))
         assert cockpit.gate.looked_up(scope) is None
-        assert (await ask(cockpit.gate.app(cockpit.echo), scope)).status == 403
+        assert (await ask(Passage(cockpit.gate, cockpit.echo), scope)).status == 403
 
 
 @in_real_time

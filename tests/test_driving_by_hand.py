@@ -11,7 +11,7 @@ from robot_rig import HALTED_MPS, RobotRig, yaw_of
 
 from cocoro import topics
 from cocoro.driving import Driving
-from cocoro.messages import DriveRequest, Motion
+from cocoro.messages import DriveRequest, Motion, Truth
 from cocoro.testing import in_virtual_time
 
 pytestmark = pytest.mark.sim
@@ -48,7 +48,7 @@ async def at_rest_after(rig: RobotRig, since_s: float) -> float:
     return moving[-1] / 1e9 - since_s
 
 
-def _speed(a: topics.m.Truth, b: topics.m.Truth) -> float:
+def _speed(a: Truth, b: Truth) -> float:
     way_m = hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1])
     return way_m / ((b.stamp_ns - a.stamp_ns) / 1e9)
 

@@ -17,6 +17,8 @@ from cocoro.keys import matches
 from cocoro.topics import (
     BASE_COMMAND,
     BASE_STATE,
+    CANCEL,
+    DRIVE,
     ESTOP,
     FRAME,
     HEALTH,
@@ -104,6 +106,22 @@ def test_a_recorder_on_another_host_hears_everything_but_the_truth(tmp_path: Pat
     local = tuple(topic.key(ROBOT) for topic in all_topics() if topic.local)
     assert Rule("brain", OUT, ("put",), (*local, TRUTH.key(ROBOT)), allow=False) in denied
     assert {rule.keys for rule in denied if rule.principal != "brain"} == {local}, "persons hear the truth"
+
+
+def test_the_host_that_the_cockpit_runs_on_may_ask_what_its_page_asks_and_no_other_host(tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text(LAB.replace('"executive"]', '"executive", "cockpit"]'), encoding="utf-8")
+    site = plan.read(tmp_path)
+    for request in (RUN, CANCEL, DRIVE, RESET.of("base"), ESTOP.of("base")):
+        assert rights(site, "brain", ROBOT).may_ask(request.key(ROBOT))
+        assert not rights(site, "body", ROBOT).may_ask(request.key(ROBOT))
+    assert not rights(site, "brain", ROBOT).may_ask(SERVOS.of("arm").key(ROBOT))
+    assert rights(site, "brain", ROBOT).may_hear("calliope/planning/map")
+
+
+def test_a_site_may_be_without_a_cockpit(lab: plan.Site) -> None:
+    assert all("cockpit" not in host.processes for host in lab.hosts.values())
+    assert "cockpit" in lab.profiles[ROBOT].processes
+    assert not rights(lab, "brain", ROBOT).may_ask(RUN.key(ROBOT))
 
 
 def test_an_author_publishes_and_serves_under_his_own_name_alone(lab: plan.Site) -> None:

@@ -22,6 +22,8 @@ def load(name: str) -> TyperCommand | TyperGroup:
     match name:
         case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
+        case "drive":
+            from apps.cli.drive import app
         case "status":
             from apps.cli.status_command import app
         case "objects":

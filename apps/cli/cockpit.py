@@ -100,7 +100,7 @@ def _address(run_dir: RunDir) -> str:
     except FileNotFoundError:
         raise RefusedError(
             f"the cockpit of {run_dir.robot} is open to this machine alone, where its user needs no code: for others "
-            f"give [service.cockpit] a host and credentials, see docs/cockpit_access.md"
+            f"give `[service.cockpit]` of its profile `host` and `credentials`"
         ) from None
 
 

@@ -20,6 +20,7 @@ _SUMMARIES = {
     TASKS: {
         "cancel": "End the running task; the robot stands still.",
         "wait": "Follow a task to its end, and exit as its own command would have.",
+        "drive": "Drive by hand with the keys of this terminal: base, head, arm and claws.",
         "rehearse": "Try a task in simulation: the whole robot in one process, in virtual time.",
     },
     WATCH: {

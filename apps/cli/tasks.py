@@ -19,6 +19,7 @@ from apps.cli.output import complain, json_error
 from apps.cli.progress import TaskDisplay
 from apps.cli.snapshot import SnapshotTaker
 from cocoro.bus.base import Handle
+from cocoro.driving import BEGIN_S
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
@@ -207,7 +208,7 @@ class Follower:
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         while not self._let_go.is_set():
-            reply = await self._link.call(RUN, self._request)
+            reply = await self._link.call(RUN, self._request, BEGIN_S if self._request.instead else None)
             latched = latch.value is not None and latch.value.state == "latched"
             patience_s = 0.0 if reply.accepted or latched else UNSETTLED_S.get(reply.refusal or "", 0.0)
             if loop.time() - begun_s >= patience_s:

@@ -47,8 +47,9 @@ class GateLimits(NamedTuple):
     """What visitors may cost."""
 
     requests: Rate = Rate(20.0, 120.0)
-    """Of one address, or of one user on loopback. The page and its files are 60 requests."""
-    requests_all: Rate = Rate(100.0, 300.0)
+    """Of one visitor, or of one address of nobody's. The page and its files are 60 requests."""
+    requests_of_nobody: Rate = Rate(20.0, 60.0)
+    """Of all who are not let in."""
     stops: Rate = Rate(5.0, 10.0)
     """STOPs of one visitor, by request or by message."""
     logins: Rate = Rate(1 / 12, 5.0)
@@ -100,7 +101,7 @@ class Gate:
         self.clock = clock
         self._people, self._certificates = people, certificates or Certificates()
         self._requests = Budgets(self.limits.requests, clock)
-        self._requests_all = Budgets(self.limits.requests_all, clock)
+        self._requests_of_nobody = Budgets(self.limits.requests_of_nobody, clock)
         self.stops = Budgets(self.limits.stops, clock)
         self._logins = Budgets(self.limits.logins, clock)
         self._logins_all = Budgets(self.limits.logins_all, clock)
@@ -108,12 +109,6 @@ class Gate:
         """Open sockets, by the visitor's key."""
 
     # --- what the service asks --------------------------------------------------------------------
-
-    def app(self, inner: App) -> App:
-        """The application behind the gate."""
-        from services.cockpit.access_passage import Passage
-
-        return Passage(self, inner)
 
     def who(self, scope: Scope) -> Visitor | None:
         """The visitor of a request; None when it is nobody's."""
@@ -170,14 +165,6 @@ class Gate:
 
     def judge(self, scope: Scope, headers: dict[str, list[str]]) -> Refusal | None:
         """Refuses a request by its head, whoever sends it."""
-        address = self.address(scope)
-        if not self._is_stop(scope):
-            if not self._requests.take(address):
-                return Refusal(429, "too many requests", "Too many requests: wait a second.\n")
-            if not self._requests_all.take(""):
-                return Refusal(503, "too many requests of all", "Too many requests: wait a second.\n")
-        elif not self.stops.take(address):
-            return Refusal(429, "too many stops", "The robot is being stopped already.\n")
         connection = self.connection(scope)
         if self.door is not None and connection is None:
             return Refusal(403, "unknown connection", "This connection has ended.\n")
@@ -192,8 +179,17 @@ class Gate:
             refusal = rules.bad_body(scope, headers, self.limits.body_bytes)
         return refusal
 
-    def _is_stop(self, scope: Scope) -> bool:
-        return (scope["type"], scope.get("method"), scope["path"]) == ("http", "POST", "/stop")
+    def overdrawn(self, scope: Scope, visitor: Visitor | None) -> Refusal | None:
+        """Refuses a request beyond the budgets. One that is rightly known does not share his with the others."""
+        if visitor is not None and rules.is_stop(scope):
+            if self.stops.take(visitor.key):
+                return None
+            return Refusal(429, "too many stops", "The robot is being stopped already.\n")
+        if not self._requests.take(self.address(scope) if visitor is None else visitor.key):
+            return Refusal(429, "too many requests", "Too many requests: wait a second.\n")
+        if visitor is None and not self._requests_of_nobody.take(""):
+            return Refusal(503, "too many requests of nobody", "Too many requests: wait a second.\n")
+        return None
 
     # --- logging in and out -----------------------------------------------------------------------
 

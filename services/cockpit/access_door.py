@@ -9,6 +9,7 @@ room takes the place of a connection that has never asked anything, so 500 silen
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import os
 import socket
 import ssl
@@ -80,12 +81,12 @@ class Connection(asyncio.Protocol):
         """Whether the log has its end."""
         self._door, self._inner = door, inner
         self._loop = door.loop
-        self.since_s = self._loop.time()
-        """When it was taken, or its last request was answered."""
+        self.since_s = door.swept_s
+        """When it was taken, or its last request was answered, by the door's sweeps."""
         self._transport: asyncio.Transport | None = None
         self._stalled_s: float | None = None
         self._overfed_s: float | None = None
-        self._bytes = Bucket(door.limits.bytes, self.since_s)
+        self._bytes = Bucket(door.limits.bytes, self._loop.time())
         self._rest = b""
         self._timer: asyncio.TimerHandle | None = None
         self._held = False
@@ -114,7 +115,10 @@ class Connection(asyncio.Protocol):
             piece, self._rest = self._rest[:PIECE], self._rest[PIECE:]
             now_s = self._loop.time()
             wait_s = self._bytes.owe(now_s, len(piece))
-            self._overfed_s = (self._overfed_s or now_s) if wait_s else None
+            if not wait_s:
+                self._overfed_s = None
+            elif self._overfed_s is None:
+                self._overfed_s = self._door.swept_s
             self._inner.data_received(piece)
             if self._rest or wait_s:
                 self._timer = self._loop.call_later(wait_s, self._hand_on)
@@ -132,7 +136,7 @@ class Connection(asyncio.Protocol):
         return self._inner.eof_received()
 
     def pause_writing(self) -> None:
-        self._stalled_s = self._loop.time()
+        self._stalled_s = self._door.swept_s
         self._inner.pause_writing()
 
     def resume_writing(self) -> None:
@@ -167,7 +171,7 @@ class Connection(asyncio.Protocol):
 
     def ends(self) -> None:
         self.busy -= 1
-        self.since_s = self._loop.time()
+        self.since_s = self._door.swept_s
 
     def abort(self) -> None:
         if self._transport is not None:
@@ -225,6 +229,8 @@ class Door:
         self.loop = asyncio.get_running_loop()
         self.sockets = (listener,)
         self.connections: dict[Address, Connection] = {}
+        self.swept_s = 0.0
+        """Time by sweeps: it stands while this process does, which is no client's fault."""
         self.audit = audit or Audit()
         self._listener, self._protocols, self.context, self._local_only = listener, protocols, context, local_only
         self.limits = limits or DoorLimits()
@@ -290,7 +296,7 @@ class Door:
 
     def _admit(self, taken: socket.socket, address: Address) -> bool:
         """Takes a connection, or closes it; returns which."""
-        key, user, why = address[0], None, ""
+        key, user, why = _who(address[0]), None, ""
         if is_loopback(address[0]):
             found = self._peers.user(address, taken.getsockname()[:2])
             key = "nobody" if found is None else f"user {found}"
@@ -301,7 +307,7 @@ class Door:
         if not why:
             why = self._no_room(key)
         if why:
-            self.audit.refused(f"{address[0]}, {key}" if key != address[0] else key, f"connection: {why}")
+            self.audit.refused(key, f"connection: {why}")
             with taken, suppress(OSError):
                 taken.setblocking(False)
                 if why == OTHERS and self.context is None:
@@ -315,7 +321,7 @@ class Door:
         self.connections[address] = connection
         task = self.loop.create_task(self._connect(taken, connection))
         self._shaking.add(task)
-        task.add_done_callback(self._shaking.discard)
+        task.add_done_callback(lambda done: self._connected(done, taken, connection))
         return True
 
     def _no_room(self, key: str) -> str:
@@ -348,18 +354,23 @@ class Door:
 
     async def _connect(self, taken: socket.socket, connection: Connection) -> None:
         seconds = HANDSHAKE_S if self.context is not None else None
-        try:
-            await self.loop.connect_accepted_socket(
-                lambda: connection, taken, ssl=self.context, ssl_handshake_timeout=seconds
-            )
-        except (OSError, asyncio.CancelledError) as error:  # of which ssl.SSLError is one
-            self.left(connection)
-            with suppress(OSError):
-                taken.close()
-            if isinstance(error, asyncio.CancelledError):
-                raise
+        await self.loop.connect_accepted_socket(
+            lambda: connection, taken, ssl=self.context, ssl_handshake_timeout=seconds
+        )
+
+    def _connected(self, task: asyncio.Task[None], taken: socket.socket, connection: Connection) -> None:
+        self._shaking.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is None and not task.cancelled():
+            return
+        self.left(connection)
+        with suppress(OSError):
+            taken.close()
+        if isinstance(error, OSError):  # of which ssl.SSLError is one
             what = getattr(error, "reason", None) or type(error).__name__
             self.audit.refused(connection.key, "connection: TLS handshake failed", str(what))
+        elif error is not None:
+            raise error
 
     # --- those that were taken --------------------------------------------------------------------
 
@@ -377,12 +388,17 @@ class Door:
             self.audit.refused(connection.key, "connection: no request of HTTP")
 
     def _sweep(self) -> None:
-        now_s = self.loop.time()
+        self.swept_s += SWEEP_S
         for connection in list(self.connections.values()):
-            if why := connection.fault(now_s, self.limits):
+            if why := connection.fault(self.swept_s, self.limits):
                 connection.told = True
                 if why != "idle":
                     self.audit.refused(connection.key, f"connection: it {why}")
                 connection.abort()
         self.audit.tell()
         self._timer = self.loop.call_later(SWEEP_S, self._sweep)
+
+
+def _who(address: str) -> str:
+    """Whom a connection counts for by its address: who has an address of IPv6 has all of its network."""
+    return str(ipaddress.ip_network(f"{address}/64", strict=False)) if ":" in address else address

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from services.cockpit import access_rules as rules
+from services.cockpit.access import App, Gate, Message, Receive, Send, Visitor
 from services.cockpit.access_limits import Bucket
 from services.cockpit.access_rules import VISITOR, Refusal, Scope
-
-if TYPE_CHECKING:
-    from services.cockpit.access import App, Gate, Message, Receive, Send, Visitor
 
 TOO_LONG, NO_TEXT, TOO_MANY, ENDED = 1009, 1003, 1008, 4401
 """Codes with which a socket is closed; the last is the cockpit's own: the visitor's session has ended."""
@@ -52,6 +49,11 @@ class Passage:
         if refusal is not None:
             await self._refuse(scope, receive, secured, refusal)
             return
+        visitor = gate.who(scope)
+        refusal = gate.overdrawn(scope, visitor)
+        if refusal is not None:
+            await self._refuse(scope, receive, secured, refusal)
+            return
         http = scope["type"] == "http"
         receive = _limited(receive, gate.limits.body_bytes, gate.limits.body_s) if http else receive
         try:
@@ -59,7 +61,6 @@ class Passage:
             if answer is not None:
                 await _answer(secured, *answer)
                 return
-            visitor = gate.who(scope)
             if visitor is None:
                 await self._send_to_login(scope, receive, secured)
                 return
@@ -139,7 +140,7 @@ class _Socket:
             return message
         text = message.get("text")
         if not self._messages.take(self._gate.clock()):
-            if text is not None and is_stop(text) and self._gate.stops.take(self._visitor.key):
+            if text is not None and is_stop_message(text) and self._gate.stops.take(self._visitor.key):
                 return message
             return await self._close(TOO_MANY, "too many messages")
         if text is None:
@@ -174,7 +175,7 @@ class _Socket:
         return {"type": "websocket.disconnect", "code": code}
 
 
-def is_stop(text: str) -> bool:
+def is_stop_message(text: str) -> bool:
     """Whether a message is a STOP; cheap, for one of a client that sends too many."""
     if len(text) > STOP_MOST or '"stop"' not in text:
         return False

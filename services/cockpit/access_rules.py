@@ -132,7 +132,7 @@ def bad_body(scope: Scope, headers: Mapping[str, list[str]], most: int) -> Refus
         return Refusal(400, "bad length", "Content-Length is no number.\n")
     if any(len(length) > 12 or int(length) > most for length in lengths):
         return Refusal(413, "long body", f"A request's body may have {most} bytes.\n")
-    if scope["method"] not in CHANGING:
+    if scope["method"] not in CHANGING or is_stop(scope):  # whatever a STOP has with it, it is one
         return None
     has_body = "transfer-encoding" in headers or any(int(length) for length in lengths)
     kinds = [kind.partition(";")[0].strip().lower() for kind in headers.get("content-type", [])]
@@ -140,6 +140,11 @@ def bad_body(scope: Scope, headers: Mapping[str, list[str]], most: int) -> Refus
     if has_body and kinds != [wanted]:
         return Refusal(415, "body's type", f"A body must be {wanted}.\n")
     return None
+
+
+def is_stop(scope: Scope) -> bool:
+    """Whether a request is the emergency stop."""
+    return (scope["type"], scope.get("method"), scope["path"]) == ("http", "POST", "/stop")
 
 
 def doing_of(method: str, path: str) -> Doing:

@@ -86,8 +86,9 @@ class App:
         if self._visitor(request.scope, "look") is None:
             return _refusal()
         cockpit, name = self._cockpit, request.path_params["name"]
+        written = await cockpit.written()
         try:
-            path = await cockpit.beside(lambda: cockpit.shelf.find(name))
+            path = await cockpit.beside(lambda: cockpit.shelf.find(name, written))
         except CocoroError as error:
             return _answered(error)
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)

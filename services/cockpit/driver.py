@@ -38,7 +38,7 @@ class Driver:
 
     async def end(self) -> Reply:
         """Let go of it."""
-        task_id = self._task()
+        task_id, self._task_id = self._task(), ""
         return await self._cockpit.asker.cancel(task_id) if task_id else Reply(False, "nobody drives by hand")
 
     def move(self, order: Drive) -> None:
@@ -48,9 +48,15 @@ class Driver:
             self._moving = asyncio.ensure_future(self._move())
 
     def close(self) -> None:
-        """The page has gone. What moved comes to rest, since nothing quotes the next tick."""
+        """The page has gone. What moved comes to rest, since nothing quotes the next tick; and the task that this page
+        began ends, so that the robot is free for others."""
         if self._moving is not None:
             self._moving.cancel()
+        if self._task_id:
+            self._cockpit.node.spawn(self._leave(self._task_id))
+
+    async def _leave(self, task_id: str) -> None:
+        await self._cockpit.asker.cancel(task_id)
 
     async def _move(self) -> None:
         while (order := self._next) is not None:

@@ -74,7 +74,7 @@ class Feed:
     async def _ask(self, topic: Topic[Any], row: Topic[Any]) -> None:
         """Ask for what would come only in up to a second; what came meanwhile is newer."""
         for message in await self._node.newest(row, NEWEST_S):
-            name = getattr(message, "service", topic.service)
+            name = getattr(message, "service", "")
             key = row.key(self._node.robot_name).replace(ANY, name)
             if self._on and key not in self._heard:
                 self._take(topic, message)

@@ -19,6 +19,7 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.messages import (
     BaseState,
+    ClockOffset,
     Detection,
     Detections,
     FloorPlan,
@@ -54,6 +55,7 @@ TOPICS: tuple[Topic[Any], ...] = (
     topics.TASK,
     topics.LATCH,
     topics.HEALTH,
+    topics.OFFSET,
     topics.RECORDING,
 )
 """What it takes; those with `{service}` in their name of all services."""
@@ -70,6 +72,8 @@ class Scene:
         self.latch: Latch | None = None
         self.recording: Recording | None = None
         self.health: dict[str, Health] = {}
+        self.hosts: dict[str, ClockOffset] = {}
+        """The hosts of a site, by name."""
         self.alive: set[str] = set()
         """Services that hold their token; in a capture nobody tells, so those that are heard count."""
         self.detections: Detections | None = None
@@ -90,6 +94,8 @@ class Scene:
         """Take one message of a topic of `TOPICS`; of any other topic nothing is taken."""
         if isinstance(message, Health):
             self.health[message.service] = message
+        elif isinstance(message, ClockOffset):
+            self.hosts[message.host] = message
         elif isinstance(message, Recording):
             self.recording = message
         elif (taker := self._takers.get(topic.name)) is not None:
@@ -134,7 +140,16 @@ class Scene:
             "latch": "unknown" if self.latch is None or _age_s(self.latch, now_ns) > SHOWN_S else self.latch.state,
             "recording": self._recording(now_ns),
             "services": self._services(now_ns),
-            "hosts": [],
+            "hosts": [
+                {
+                    "host": host.host,
+                    "clock": host.state,
+                    "ahead_s": _rounded(host.ahead_s),
+                    "unanswered": host.unanswered,
+                    "age_s": round(_age_s(host, now_ns), 1),
+                }
+                for _, host in sorted(self.hosts.items())
+            ],
             "drive": {"task_id": self.task.task_id} if self.drives else None,
         }
 

@@ -20,6 +20,7 @@ import uvicorn
 from cocoro.errors import ConfigError
 from services.cockpit.access import App, Gate
 from services.cockpit.access_door import BACKLOG
+from services.cockpit.access_passage import Passage
 from services.cockpit.access_serving import HEAD_BYTES, DoorServer, keep_renewed, open_door
 from services.cockpit.access_tls import Entrance
 
@@ -63,7 +64,7 @@ async def serving(app: App, gate: Gate, listening: socket.socket, entrance: Entr
     logging.getLogger("uvicorn").setLevel(logging.ERROR)  # door and gate log what is malformed, without a flood
     logging.getLogger("uvicorn.error").addFilter(_of_ours)
     config = uvicorn.Config(
-        gate.app(app), loop="none", http="h11", ws="websockets-sansio", lifespan="off", log_config=None,
+        Passage(gate, app), loop="none", http="h11", ws="websockets-sansio", lifespan="off", log_config=None,
         log_level="error", access_log=False, proxy_headers=False, server_header=False, date_header=False,
         interface="asgi3", ws_max_size=MESSAGE_BYTES, ws_per_message_deflate=False,
         h11_max_incomplete_event_size=HEAD_BYTES, timeout_graceful_shutdown=ENDING_S,

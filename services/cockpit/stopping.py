@@ -6,6 +6,7 @@ The first datagrams leave before this module does anything else, and a thread of
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -85,12 +86,13 @@ class _Stop:
     def _hear(self, asking: Asking) -> None:
         with asking:
             asking.go_on(time.monotonic() + PATH_S)
-            silent = {point.service for point in asking.waiting}
+            silent = {point.service for point in asking.waiting if point.uid == os.getuid()}
         self._in_loop(self._path_over, silent)
 
     def _heard(self, point: Point) -> None:
         """Called in the thread."""
-        assert point.latched_ns is not None
+        if point.latched_ns is None or point.uid != os.getuid():  # another user's robot of this name
+            return
         self._in_loop(self._acknowledge, point.service, (point.latched_ns - self._started_ns) / 1e6)
 
     def _in_loop(self, callback: Callable[..., None], *arguments: Any) -> None:

@@ -92,6 +92,8 @@ class Course:
         self._planned_ns: int | None = None
         self._stuck_since_ns: int | None = None
         self._last_stretch = False
+        self.walled = False
+        """The newest plan found no way: neither is the arc free nor is there a detour."""
         self._escape = Escape(self._body_m, self._config.clearance_m)
 
     def step(
@@ -147,12 +149,13 @@ class Course:
         free = self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields)
         if free and self._serves(preview[-1]):
             self._detour = None
-            self._last_stretch = True
+            self._last_stretch, self.walled = True, False
             return
         self._last_stretch = False
         if self._detour is not None and self._still_good(self._detour, fields, target_m):
             return
         self._detour = self._around(target_m, body, around, fields)
+        self.walled = self._detour is None
 
     def _free(self, poses: list[Pose2], fields: Fields, share: float, arm_from_m: float) -> bool:
         """Whether body and (over the last `arm_from_m`) hand pass all poses with this share of their margins."""
