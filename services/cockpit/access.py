@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 
 from cocoro.errors import CocoroError, RefusedError
 from services.cockpit import access_rules as rules
-from services.cockpit.access_door import Connection, Door, DoorLimits
-from services.cockpit.access_limits import Audit, Budgets, Clock, Rate
+from services.cockpit.access_connection import Connection
+from services.cockpit.access_door import Door
+from services.cockpit.access_limits import Audit, Budgets, Clock, DoorLimits, Rate
 from services.cockpit.access_login import CODE_FIELD, login_page, style
 from services.cockpit.access_people import SESSION_S, People
 from services.cockpit.access_rules import Doing as Doing

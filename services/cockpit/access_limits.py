@@ -24,6 +24,32 @@ class Rate(NamedTuple):
     burst: float
 
 
+class DoorLimits(NamedTuple):
+    """What connections may cost."""
+
+    connections: int = 96
+    """Open at once."""
+    each: int = 32
+    """Of one address; on loopback, of one user."""
+    takes: Rate = Rate(40.0, 80.0)
+    """New connections of one address or user."""
+    takes_all: Rate = Rate(100.0, 200.0)
+    refusals: Rate = Rate(1000.0, 500.0)
+    """Beyond that the door is closed for SHUT_S, and the kernel lets others wait."""
+    handshakes: int = 8
+    """TLS handshakes at once."""
+    bytes: Rate = Rate(24 * 1024.0, 128 * 1024.0)
+    """Received in one connection, which is read no faster. The page sends 8 KiB/s while somebody drives."""
+    first_s: float = 10.0
+    """Until the first request is whole."""
+    idle_s: float = 20.0
+    """Between two requests."""
+    stalled_s: float = 15.0
+    """For so long a client may take nothing of what waits for it."""
+    overfed_s: float = 10.0
+    """For so long a client may send more than `bytes` without a break."""
+
+
 class Bucket:
     """A budget: `take` succeeds `rate.burst` times at once, and `rate.per_s` times a second in the long run."""
 
