@@ -75,7 +75,7 @@ export class FloorMap {
   /** Draw the cells anew, with the colours of now. */
   paint() {
     forgetColours();
-    if (this.cells !== null) {
+    if (this.cells?.length) {
       const { width, height } = this.plan;
       const tones = ["unknown", "free", "wall"].map((name) => colour(name).match(/[\d.]+/g).map(Number));
       const image = new ImageData(height, width); // its rows are x, from far to near; its columns are y, from left to right

@@ -33,6 +33,7 @@ export class View {
     await new Promise((resolve) => requestAnimationFrame(resolve));
     this.image?.close();
     [this.header, this.image, this.shownMs] = [header, image, performance.now()];
+    this.canvas.dataset.stamp = header.stamp;
     this.draw();
     this.#tellAge();
   }
