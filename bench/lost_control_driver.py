@@ -13,8 +13,8 @@ import sys
 import time
 from pathlib import Path
 
-from apps.cli.choice import RobotChoice
 from apps.cli.link import MeshLink, joined
+from apps.client.choice import RobotChoice
 from cocoro.driving import Driving, begin
 from cocoro.errors import CocoroError
 from cocoro.messages import Motion
