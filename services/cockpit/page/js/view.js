@@ -71,12 +71,12 @@ export class View {
     context.clip();
     context.imageSmoothingQuality = "high";
     context.drawImage(this.image, ...box);
-    context.restore();
-    this.#putAge(place);
     const at = ([u, v]) => [place.x + (u + 0.5) * place.scale, place.y + (v + 0.5) * place.scale];
     const { marks } = this.header;
     if (marks.way?.length > 1) this.#way(context, marks.way.map(at));
     if (marks.goal) this.#ring(context, at(marks.goal));
+    context.restore();
+    this.#putAge(place);
     for (const found of marks.detections) this.#detection(context, found, at);
     if (marks.hand) this.#hand(context, at(marks.hand));
     if (this.cross) this.#crosshair(context, at(this.cross));
