@@ -68,7 +68,8 @@ class Beside:
 @pytest.fixture(scope="module")
 def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, daemon=True).start()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
     folder = tmp_path_factory.mktemp("cockpit")
     (folder / "far.toml").write_text(SCENE)
     # STOP reaches all robots of a name on this machine: this one has its own.
@@ -84,6 +85,8 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     finally:
         asyncio.run_coroutine_threadsafe(life.__aexit__(None, None, None), loop).result()
         loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +181,7 @@ def test_what_was_recorded_is_watched_on_the_same_screen(page: Page, beside: Bes
     for _ in range(3):
         next_picture(page)
     expect(page.locator("#now-task")).to_contain_text("Fetch red can")
+    page.wait_for_selector("#map[data-cells]")
     page.click("#play-pause")
     expect(page.locator("#play-pause")).to_have_attribute("aria-label", "Play")
     page.click("#play-end")

@@ -50,6 +50,7 @@ export class FloorMap {
     const cells = new Uint8Array(await new Response(stream).arrayBuffer());
     if (plan === this.plan && cells.length === plan.width * plan.height) {
       this.cells = cells;
+      this.canvas.dataset.cells = `${plan.width}x${plan.height}`;
       this.paint();
     }
   }
@@ -68,6 +69,7 @@ export class FloorMap {
   }
 
   clear() {
+    delete this.canvas.dataset.cells;
     [this.plan, this.cells, this.raster, this.body, this.known, this.trail, this.middle] = [null, null, null, null, [], [], null];
     this.draw();
   }
