@@ -134,6 +134,17 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 
 
 @in_virtual_time
+async def test_sockets_that_are_opened_again_and_again_are_refused_until_time_has_passed() -> None:
+    rig = Rig(GateLimits(openings=Rate(1.0, 3.0)))
+    scope = head(path="/live", headers=[OWN], scheme="ws")
+    opened = [(await speak(rig.app, dict(scope), ["hello"])).accepted for _ in range(5)]
+    assert opened == [True] * 3 + [False] * 2
+    assert rig.audit.has("too many new sockets")
+    rig.now_s += 1.0
+    assert (await speak(rig.app, dict(scope), ["hello"])).accepted
+
+
+@in_virtual_time
 async def test_a_socket_ends_with_its_visitors_session() -> None:
     rig = Rig(visitor=VIEWER)
 
