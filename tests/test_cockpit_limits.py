@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
 from cockpit_access_rig import ask, head, speak
 from test_cockpit_gate import OWN, VIEWER, Rig
 
 from cocoro.testing import in_virtual_time
 from services.cockpit.access import GateLimits, Message, Receive, Send
-from services.cockpit.access_limits import Rate
+from services.cockpit.access_limits import Audit, Budgets, Rate
 from services.cockpit.access_passage import Passage
 from services.cockpit.access_rules import Scope
 
@@ -134,6 +135,17 @@ async def test_sockets_beyond_a_visitors_number_are_refused() -> None:
 
 
 @in_virtual_time
+async def test_sockets_that_are_opened_again_and_again_are_refused_until_time_has_passed() -> None:
+    rig = Rig(GateLimits(openings=Rate(1.0, 3.0)))
+    scope = head(path="/live", headers=[OWN], scheme="ws")
+    opened = [(await speak(rig.app, dict(scope), ["hello"])).accepted for _ in range(5)]
+    assert opened == [True] * 3 + [False] * 2
+    assert rig.audit.has("too many new sockets")
+    rig.now_s += 1.0
+    assert (await speak(rig.app, dict(scope), ["hello"])).accepted
+
+
+@in_virtual_time
 async def test_a_socket_ends_with_its_visitors_session() -> None:
     rig = Rig(visitor=VIEWER)
 
@@ -151,3 +163,50 @@ async def test_a_socket_ends_with_its_visitors_session() -> None:
     spoken = await speak(hurrying, head(path="/live", headers=[OWN], scheme="ws"), ["hello", "end", "after"])
     assert spoken.code == 4401
     assert rig.echo.messages == ["hello"]
+
+
+# --- the log ---------------------------------------------------------------------------------------------
+
+
+def test_a_flood_of_refusals_is_few_lines_with_their_number(caplog: pytest.LogCaptureFixture) -> None:
+    now_s = 0.0
+    audit = Audit(lambda: now_s, every_s=10.0)
+    for _ in range(1000):
+        audit.refused("10.0.0.5", "foreign host", "GET /")
+    assert [record.message for record in caplog.records] == ["refused: 10.0.0.5: foreign host (GET /)"]
+    now_s = 10.0
+    audit.tell()
+    assert "998 times more" in caplog.records[-1].message
+    audit.refused("10.0.0.6", "foreign host")
+    assert len(caplog.records) == 3
+    assert audit.refusals == 1001
+
+
+def test_a_flood_of_clients_is_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+    now_s = 0.0
+    audit = Audit(lambda: now_s, kinds=16)
+    for number in range(1000):
+        audit.refused(f"10.0.{number // 256}.{number % 256}", "foreign host")
+    assert len(caplog.records) <= 17
+    now_s = 10.0
+    audit.tell()
+    assert "too many clients" in caplog.records[-1].message
+
+
+def test_what_a_client_sends_cannot_forge_a_line(caplog: pytest.LogCaptureFixture) -> None:
+    Audit(lambda: 0.0).refused("10.0.0.5", "bad path", "GET /a\r\n2026-12-01 refused: nobody\x1b[2J\u202e" + "x" * 500)
+    (record,) = caplog.records
+    assert "\n" not in record.message
+    assert record.message.isprintable()
+    assert len(record.message) < 300
+
+
+def test_a_budget_is_forgotten_when_it_is_full_and_the_others_are_kept() -> None:
+    now_s = 0.0
+    budgets = Budgets(Rate(1.0, 2.0), lambda: now_s, keys=4)
+    assert [budgets.take("one") for _ in range(3)] == [True, True, False]
+    for key in "abc":
+        budgets.take(key)
+    now_s = 1.5
+    budgets.take("new")  # a, b and c are full again
+    assert [budgets.take("one") for _ in range(2)] == [True, False]

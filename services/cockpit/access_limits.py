@@ -122,7 +122,7 @@ class Audit:
         self._seen: dict[tuple[str, str], tuple[float, int]] = {}
         """By client and kind: when its next line may come, and how often it was refused since the last one."""
         self.refusals = 0
-        self._untold = 0
+        self._untold, self._untold_due_s = 0, 0.0
 
     def refused(self, who: str, what: str, detail: str = "") -> None:
         """`who` is the client's address and key, `what` the kind of refusal, `detail` what this one asked for."""
@@ -130,8 +130,7 @@ class Audit:
         now_s, key = self._clock(), (who, what)
         due_s, count = self._seen.get(key, (now_s, 0))
         if key not in self._seen and len(self._seen) >= self._kinds:
-            self.tell()
-            self._seen = {key: row for key, row in self._seen.items() if row[0] > now_s}
+            self._tell_due(now_s)
             if len(self._seen) >= self._kinds:
                 self._untold += 1
                 return
@@ -148,6 +147,13 @@ class Audit:
     def tell(self) -> None:
         """Logs the numbers that are due. Called now and then, so that the last refusals of a flood are told, too."""
         now_s = self._clock()
+        self._tell_due(now_s)
+        if self._untold and now_s >= self._untold_due_s:
+            log.warning("refused: %d times more, of too many clients to name each", self._untold)
+            self._untold, self._untold_due_s = 0, now_s + self._every_s
+
+    def _tell_due(self, now_s: float) -> None:
+        """Logs the numbers of those whose line is due, and forgets those that have not come again."""
         for (who, what), (due_s, count) in list(self._seen.items()):
             if now_s < due_s:
                 continue
@@ -156,9 +162,6 @@ class Audit:
                 self._line(who, what, "", count - 1)
             else:
                 del self._seen[who, what]
-        if self._untold:
-            log.warning("refused: %d times more, of too many clients to name each", self._untold)
-            self._untold = 0
 
     def _line(self, who: str, what: str, detail: str, more: int) -> None:
         times = f", {more} times more in {self._every_s:.0f} s" if more else ""
