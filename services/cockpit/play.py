@@ -112,7 +112,7 @@ class PlaySocket:
     async def _step(self, playback: Playback, pictures: Pictures) -> None:
         loop = asyncio.get_running_loop()
         viewing = Viewing(self._looking, lambda picture: self._outbox.put("picture", picture))
-        shown, count = None, 0
+        shown, floor, count = None, None, 0
         marks: dict[str, Any] = {"marks": [mark._asdict() for mark in playback.marks]}
         while True:
             await self._beside(lambda: self._go_on(playback, loop.time()))
@@ -128,6 +128,9 @@ class PlaySocket:
             self._asked.clear()
             if count % TOLD_EVERY == 0:
                 self._outbox.put("state", encoded(playback.scene.state(playback.now_ns)))
+                if playback.scene.floor is not floor and (plan := playback.scene.map()) is not None:
+                    floor = playback.scene.floor
+                    self._outbox.put("map", encoded(plan))
                 self._outbox.put("played", encoded(self._played(playback) | marks))
             count += 1
             await asyncio.sleep(STEP_S if not playback.paused else TOLD_EVERY * STEP_S)

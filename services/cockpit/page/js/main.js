@@ -10,7 +10,7 @@ import { FloorMap } from "./map.js";
 import { Menu } from "./menu.js";
 import { showNow } from "./now.js";
 import { Player } from "./player.js";
-import { accepted, announce } from "./said.js";
+import { accepted, announce, notice } from "./said.js";
 import * as stopping from "./stop.js";
 import { Tasks } from "./tasks.js";
 import { View } from "./view.js";
@@ -21,6 +21,7 @@ const THEMES = ["auto", "light", "dark"];
 const LOW_BATTERY = 0.25;
 const EMPTY_BATTERY = 0.12;
 const TOO_SOON_MS = 700;
+const SESSION_ENDED = 4401;
 
 const app = the("app");
 document.documentElement.dataset.theme = kept("theme") ?? "auto";
@@ -98,10 +99,11 @@ live.on("hello", (message) => {
   greet();
   if (shown === live) linkState("live");
 });
-live.on("lost", ({ code }) => {
+live.on("lost", async ({ code, reason }) => {
   if (shown === live) linkState("lost");
   announce(say("link.lost"));
-  if (code === 1008 || code === 4401 || code === 4403) location.reload(); // the server asks who this is
+  if (reason) notice(reason);
+  if (code === SESSION_ENDED || (await loggedOut())) location.reload(); // the server asks who this is
 });
 live.on("stopped", (message) => stopping.stopped(message));
 live.on("log", takeLog);
@@ -127,6 +129,7 @@ function greet() {
   write(the("robot"), hello.robot);
   document.title = `${hello.robot} – CoCoRo`;
   map.bodyM = hello.body?.radius_m ?? map.bodyM;
+  view.quiet = new Set((hello.objects ?? []).filter((item) => !item.graspable).map((item) => item.label));
   captures.mayChange = hello.role === "operator";
   tasks.greet(hello);
   drive.greet(hello);
@@ -162,12 +165,24 @@ function openPanel(name) {
     button.setAttribute("aria-expanded", String(open));
     if (!open) continue;
     const close = make("button", { type: "button", class: "round", "aria-label": say("close"), onclick: () => openPanel(null) }, "✕");
-    the(each).replaceChildren(make("header", {}, make("h2", {}, say(`${each}.title`)), each === "log" ? logChoice() : "", close));
+    const extra = { log: () => [logChoice()], health: personal, captures: () => [] }[each]();
+    the(each).replaceChildren(make("header", {}, make("h2", {}, say(`${each}.title`)), ...extra, close));
     delete the(each).dataset.seen;
     if (each === "captures") captures.open();
     close.focus();
   }
   live.send({ do: "log", on: name === "log" && !the("log").hidden });
+}
+
+/** What belongs to the person: the language, for a head that has no room for it, and the end of a session. */
+function personal() {
+  const language = make("button", { type: "button", class: "plain", onclick: () => the("language").click() }, say("language"));
+  const logOut = async () => {
+    await fetch("/logout", { method: "POST", redirect: "manual" });
+    location.assign("/login");
+  };
+  const end = make("button", { type: "button", class: "plain", onclick: logOut }, say("log_out"));
+  return location.protocol === "https:" ? [language, end] : [language];
 }
 
 for (const name of PANELS) the(`open-${name}`).addEventListener("click", () => openPanel(name));
@@ -184,6 +199,12 @@ the("release").addEventListener("click", async () => {
   if (accepted(await live.ask({ do: "reset" }))) announce(say("stop.released"));
 });
 document.addEventListener("visibilitychange", () => live.send({ do: "pictures", on: shown === live && !document.hidden }));
+
+/** Whether the server is there and does not know this browser: its session has ended. */
+async function loggedOut() {
+  const answer = await fetch("/health", { redirect: "manual" }).catch(() => null);
+  return answer !== null && (answer.type === "opaqueredirect" || answer.status === 401);
+}
 
 /** Colours of canvases follow the theme. */
 function repaint() {

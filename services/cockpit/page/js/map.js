@@ -50,6 +50,7 @@ export class FloorMap {
     const cells = new Uint8Array(await new Response(stream).arrayBuffer());
     if (plan === this.plan && cells.length === plan.width * plan.height) {
       this.cells = cells;
+      this.canvas.dataset.cells = `${plan.width}x${plan.height}`;
       this.paint();
     }
   }
@@ -68,6 +69,7 @@ export class FloorMap {
   }
 
   clear() {
+    delete this.canvas.dataset.cells;
     [this.plan, this.cells, this.raster, this.body, this.known, this.trail, this.middle] = [null, null, null, null, [], [], null];
     this.draw();
   }
@@ -75,7 +77,7 @@ export class FloorMap {
   /** Draw the cells anew, with the colours of now. */
   paint() {
     forgetColours();
-    if (this.cells !== null) {
+    if (this.cells?.length) {
       const { width, height } = this.plan;
       const tones = ["unknown", "free", "wall"].map((name) => colour(name).match(/[\d.]+/g).map(Number));
       const image = new ImageData(height, width); // its rows are x, from far to near; its columns are y, from left to right

@@ -14,15 +14,25 @@ export function showNow(state, mayCancel) {
   write(the("now-task"), task?.task_id ? outcome(task) : say("now.idle"));
   const phase = runs ? [called("phase", task.phase), task.distance_m != null ? metres(task.distance_m) : "", span(task.elapsed_s ?? 0)] : [];
   steps(the("now-phases"), runs ? (task.phases ?? []).length : 0, phase.filter(Boolean).join(" · "));
-  write(the("now-why"), (runs ? plan?.why || task.text : task?.reason || plan?.why) || say("now.stands"));
-  mark(the("now-task"), "class", runs ? null : { done: "good", failed: "bad" }[task?.outcome]);
-  const news = task?.task_id ? `${title(task)}: ${runs ? called("phase", task.phase) : say(`outcome.${task.outcome}`)}` : "";
+  write(the("now-why"), (runs ? plan?.why || task.text : sentence(task?.reason) || plan?.why) || say("now.stands"));
+  mark(the("now-task"), "class", runs ? null : { done: "good", failed: "bad", stopped: "warn" }[ending(task)]);
+  const news = task?.task_id ? `${title(task)}: ${runs ? called("phase", task.phase) : say(`outcome.${ending(task)}`)}` : "";
   if (news && news !== told) announce(news);
   told = news;
 }
 
 function outcome(task) {
-  return task.outcome ? `${title(task)} — ${say(`outcome.${task.outcome}`)}` : title(task);
+  return task.outcome ? `${title(task)} — ${say(`outcome.${ending(task)}`)}` : title(task);
+}
+
+/** How a task ended; one that failed because of the emergency stop was stopped. */
+function ending(task) {
+  return task?.reason?.startsWith("estop") ? "stopped" : task?.outcome;
+}
+
+/** A reason without the word for programs before it. */
+function sentence(reason) {
+  return (reason ?? "").replace(/^\w+: /, "");
 }
 
 /** One dot for each phase so far, then the present one in words. */

@@ -17,6 +17,7 @@ export class View {
     this.aimed = null;
     this.drivingKeys = false;
     this.isPlay = false;
+    this.quiet = new Set();
     this.onPoint = onPoint;
     this.canvas.addEventListener("click", (event) => this.#click(event));
     this.canvas.addEventListener("pointermove", (event) => this.#hover(event));
@@ -33,6 +34,7 @@ export class View {
     await new Promise((resolve) => requestAnimationFrame(resolve));
     this.image?.close();
     [this.header, this.image, this.shownMs] = [header, image, performance.now()];
+    this.canvas.dataset.stamp = header.stamp;
     this.draw();
     this.#tellAge();
   }
@@ -69,12 +71,12 @@ export class View {
     context.clip();
     context.imageSmoothingQuality = "high";
     context.drawImage(this.image, ...box);
-    context.restore();
-    this.#putAge(place);
     const at = ([u, v]) => [place.x + (u + 0.5) * place.scale, place.y + (v + 0.5) * place.scale];
     const { marks } = this.header;
     if (marks.way?.length > 1) this.#way(context, marks.way.map(at));
     if (marks.goal) this.#ring(context, at(marks.goal));
+    context.restore();
+    this.#putAge(place);
     for (const found of marks.detections) this.#detection(context, found, at);
     if (marks.hand) this.#hand(context, at(marks.hand));
     if (this.cross) this.#crosshair(context, at(this.cross));
@@ -126,12 +128,14 @@ export class View {
     const [right, bottom] = at([found.box[2] - 0.5, found.box[3] - 0.5]);
     const pad = 4 * unit;
     const aimed = this.aimed === found.label;
-    for (const [shade, width] of [["#000a", 4.5], ["#ffffff", aimed ? 3.5 : 2]]) {
+    const quiet = this.quiet.has(found.label) && !aimed;
+    for (const [shade, width] of [["#000a", quiet ? 3 : 4.5], ["#ffffff", aimed ? 3.5 : quiet ? 1 : 2]]) {
       this.#line(context, shade, width * unit);
       context.beginPath();
       context.roundRect(left - pad, top - pad, right - left + 2 * pad, bottom - top + 2 * pad, 6 * unit);
       context.stroke();
     }
+    if (quiet) return;
     const text = called("object", found.label) + (found.note ? ` (${sayNote(found.note)})` : "");
     context.font = `600 ${12.5 * unit}px system-ui, sans-serif`;
     const wide = context.measureText(text).width + 12 * unit;
