@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from cocoro.bus.base import Qos
-from cocoro.capture.columns import Column, Columns, MissingColumnError, flattened
+from cocoro.capture.columns import Column, Columns, MissingColumnError
 from cocoro.capture.contents import miscounted
 from cocoro.capture.former import todays_name
 from cocoro.capture.mcap import DamageError
@@ -145,7 +145,7 @@ class Tables(Mapping[str, Columns]):
                     messages.append(message)
                     log_ns.append(one[0])
             start = end
-        return Columns({**self._times(log_ns), **flattened(messages)}, len(messages))
+        return Columns(self._times(log_ns), messages)
 
     def _times(self, log_ns: list[int]) -> dict[str, Column]:
         when = np.array(log_ns, dtype=np.int64)
@@ -196,7 +196,9 @@ class Tables(Mapping[str, Columns]):
         except DamageError as damage:
             self.capture.add_problem(f"a message of {topic} is left out: {damage}")
             return None
-        return message if isinstance(message, Mapping) else {"value": message}
+        return (
+            {str(name): value for name, value in message.items()} if isinstance(message, dict) else {"value": message}
+        )
 
     # --- pictures ---------------------------------------------------------------------------------
 
@@ -225,7 +227,7 @@ class Tables(Mapping[str, Columns]):
         """Times and numbers of pictures, without their pixels."""
         taken = sorted(((log_ns, head) for log_ns, head in self._heads(channels)), key=itemgetter(0))
         heads = [head for _, head in taken]
-        return Columns({**self._times([log_ns for log_ns, _ in taken]), **flattened(heads)}, len(heads))
+        return Columns(self._times([log_ns for log_ns, _ in taken]), heads)
 
     def _heads(self, channels: tuple[int, ...]) -> Iterator[tuple[int, MessageHead]]:
         decode = msgspec.msgpack.Decoder(MessageHead).decode
