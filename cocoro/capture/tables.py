@@ -6,13 +6,15 @@
         for frame in capture.frames():
             print(frame.stamp_ns, frame.width)
 
-Messages are taken from the file and decoded many at once: several times as fast as a loop over messages
-(`python -m bench open`).
+Messages are found by the file's indices and decoded many at once: in about half of the time of a loop over messages
+(`python -m bench open`). A field's column is made when it is used first.
 """
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
@@ -113,6 +115,10 @@ class Tables(Mapping[str, Columns]):
     def load(self, *topics: str) -> None:
         """Reads these topics in one pass over the file; a topic that is asked for by itself takes a pass of its own.
         Raises what `[]` raises."""
+        with _uncollected():
+            self._load(topics)
+
+    def _load(self, topics: tuple[str, ...]) -> None:
         wanted = {topic: self._channels(topic) for topic in topics if topic not in self._columns}
         small = {topic: channels for topic, channels in wanted.items() if topic not in self._large}
         taken = self._take({channel for channels in small.values() for channel in channels}) if small else {}
@@ -249,6 +255,19 @@ class Tables(Mapping[str, Columns]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the collector of cycles, which would look at all messages again and again while their number grows; there
+    are no cycles in messages."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _together(taken: list[_Taken], kind: Any) -> list[Any]:
