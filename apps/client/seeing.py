@@ -102,8 +102,8 @@ class FramePairs:
     async def take(
         self, frame_s: float = FRAME_S, detections_s: float = DETECTIONS_S
     ) -> tuple[Frame, Detections | None]:
-        """The newest frame with its detections, and closes; without them when perception is silent. Raises MeshError
-        when the robot sends no frames."""
+        """The newest frame with its detections, and closes; without them when perception is silent, or `detections_s`
+        is 0. Raises MeshError when the robot sends no frames."""
         try:
             if not await within(frame_s, lambda: bool(self._frames or self._pair), self._changed):
                 raise MeshError(f"no frame from the camera within {frame_s:g} s: see `cocoro status`")
@@ -111,7 +111,9 @@ class FramePairs:
                 await within(detections_s, lambda: self._pair is not None, self._changed)
         finally:
             self.close()
-        return self._pair or (next(reversed(self._frames.values())), None)
+        if self._pair is not None:
+            return self._pair if detections_s else (self._pair[0], None)
+        return next(reversed(self._frames.values())), None
 
     def _on_frame(self, frame: Frame) -> None:
         self._frames[frame.incarnation, frame.seq] = frame

@@ -27,25 +27,39 @@ class Columns(Mapping[str, Column]):
     what has no fixed shape, are columns of objects, None where they are missing.
     """
 
-    def __init__(self, columns: Mapping[str, Column], rows: int) -> None:
-        self._columns = dict(columns)
-        self.rows = rows
+    def __init__(self, head: Mapping[str, Column], messages: Sequence[Any]) -> None:
+        """`head`: columns beside those of the messages, which are structs of one type or maps. A field's columns are
+        made when they are used first."""
+        self._columns: dict[str, dict[str, Column] | None] = {name: {name: column} for name, column in head.items()}
+        """The columns of each field, in order; None before they are made."""
+        self._columns |= dict.fromkeys(_names(messages))
+        self._messages = messages
+        self.rows = len(messages)
         """Number of messages."""
 
     def __getitem__(self, name: str) -> Column:
-        try:
-            return self._columns[name]
-        except KeyError:
-            raise MissingColumnError(f"no column {name!r}; {choice_of(name, self._columns)}") from None
+        for field in self._columns:
+            if (name == field or name.startswith(f"{field}.")) and (column := self._of(field).get(name)) is not None:
+                return column
+        raise MissingColumnError(f"no column {name!r}; {choice_of(name, self)}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
+        return chain.from_iterable(self._of(field) for field in self._columns)
 
     def __len__(self) -> int:
-        return len(self._columns)
+        return sum(len(self._of(field)) for field in self._columns)
+
+    def __contains__(self, name: object) -> bool:
+        return name in [*self]
+
+    def _of(self, field: str) -> dict[str, Column]:
+        made = self._columns[field]
+        if made is None:
+            made = self._columns[field] = _columns(field, _values(self._messages, field))
+        return made
 
     def __repr__(self) -> str:
-        return f"<{self.rows} rows: {', '.join(self._columns)}>"
+        return f"<{self.rows} rows: {', '.join(self)}>"
 
     def exploded(self, name: str) -> Columns:
         """A column of tuples of structs, such as `detections`, as columns of its own with a row for each item: its
@@ -53,11 +67,11 @@ class Columns(Mapping[str, Column]):
         column = self[name]
         items = list(chain.from_iterable(each for each in column if each is not None))
         lengths = [0 if each is None else len(each) for each in column]
-        return Columns({"row": np.repeat(np.arange(self.rows), lengths), **flattened(items)}, len(items))
+        return Columns({"row": np.repeat(np.arange(self.rows), lengths)}, items)
 
     def flat(self) -> dict[str, Column]:
         """All columns with one value a row: those of tuples are split, and named with their numbers, `odometry_m.0`."""
-        return dict(chain.from_iterable(_split(name, column) for name, column in self._columns.items()))
+        return dict(chain.from_iterable(_split(name, column) for name, column in self.items()))
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame of `flat`. Raises ConfigError when pandas is not installed."""
@@ -84,30 +98,37 @@ class MissingColumnError(ConfigError, KeyError):
 
 
 def flattened(messages: Sequence[Any], prefix: str = "") -> dict[str, Column]:
-    """The columns of messages: structs of one type, or maps; None for one that is missing."""
+    """All columns of messages: structs of one type, or maps; None for one that is missing."""
     found: dict[str, Column] = {}
-    for name, values in _fields(messages):
-        found.update(_columns(f"{prefix}{name}", values))
+    for name in _names(messages):
+        found.update(_columns(f"{prefix}{name}", _values(messages, name)))
     return found
 
 
-def _fields(messages: Sequence[Any]) -> Iterator[tuple[str, list[Any]]]:
+def _names(messages: Sequence[Any]) -> list[str]:
+    """The fields of messages: those of every message first, then those of this kind in their own order."""
     kinds = set(map(type, messages))
-    gaps = type(None) in kinds
     kind = next((each for each in kinds if issubclass(each, msgspec.Struct)), None)
     if kind is not None:
-        for name in _in_order(kind.__struct_fields__):
-            take = attrgetter(name)
-            yield name, [None if each is None else take(each) for each in messages] if gaps else [*map(take, messages)]
-    else:
-        given = [message for message in messages if message is not None] if gaps else messages
-        for name in _in_order(dict.fromkeys(chain.from_iterable(given))):
-            yield str(name), [None if message is None else message.get(name) for message in messages]
+        return _in_order(kind.__struct_fields__)
+    return _in_order(dict.fromkeys(chain.from_iterable(message for message in messages if message is not None)))
 
 
-def _in_order(names: Iterable[str]) -> list[str]:
-    """The fields of every message first, then those of this one in their own order."""
-    return sorted(names, key=lambda name: HEAD.index(name) if name in HEAD else len(HEAD))
+def _values(messages: Sequence[Any], name: str) -> list[Any]:
+    """A field of each message; None where message or field are missing."""
+    kinds = set(map(type, messages))
+    if any(issubclass(kind, msgspec.Struct) for kind in kinds):
+        take = attrgetter(name)
+        return (
+            [None if each is None else take(each) for each in messages]
+            if type(None) in kinds
+            else [*map(take, messages)]
+        )
+    return [None if message is None else message.get(name) for message in messages]
+
+
+def _in_order(names: Iterable[Any]) -> list[str]:
+    return sorted(map(str, names), key=lambda name: HEAD.index(name) if name in HEAD else len(HEAD))
 
 
 def _columns(name: str, values: list[Any]) -> dict[str, Column]:
