@@ -80,6 +80,9 @@ class Skills(Protocol):
     async def keep_doing(self, action: Action, *, until_s: float, watch: Callable[[PlannerStatus], None] = ...) -> None:
         """Have the planner carry out an action that has no end, until a time (`now_s`). `watch` gets its statuses."""
 
+    def since_input_s(self) -> float:
+        """Time since an operator's motion counted last (action `drive`), or since the task began."""
+
     def measure(self, name: str, value: float) -> None:
         """Set one of the task's `measures`, which its state tells."""
 
@@ -124,8 +127,8 @@ class Task(Tagged, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
         """Time limit of the whole task where its request has none."""
         return limits.task_timeout_s
 
-    async def run(self, skills: Skills) -> None:
-        """The routine. Raises TaskFailedError when the task fails."""
+    async def run(self, skills: Skills) -> str | None:
+        """The routine. Raises TaskFailedError when the task fails. May return why it is done, as `TaskState.reason`."""
         raise NotImplementedError
 
 

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from itertools import pairwise
 from math import hypot
@@ -247,12 +247,18 @@ def _speed_mps(a: Truth, b: Truth) -> float:
 
 @asynccontextmanager
 async def live(
-    folder: Path, *, name: str = "calliope", scene: Path | str = "paper", mesh: str = "", **sim: Any
+    folder: Path,
+    *,
+    name: str = "calliope",
+    scene: Path | str = "paper",
+    mesh: str = "",
+    processes: Sequence[str] = PROCESSES,
+    **sim: Any,
 ) -> AsyncIterator[LiveRobot]:
     """Start a robot and shut it down at the end. `sim`: settings of the simulator besides `SLOW`."""
     root = short_folder()
     robot = LiveRobot(name, root, folder)
-    robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh))
+    robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh, processes))
     try:
         await robot.start()
         yield robot
@@ -261,6 +267,6 @@ async def live(
         shutil.rmtree(root)
 
 
-def profile_text(name: str, sim: Mapping[str, Any], mesh: str = "") -> str:
+def profile_text(name: str, sim: Mapping[str, Any], mesh: str = "", processes: Sequence[str] = PROCESSES) -> str:
     settings = "".join(f"{key} = {json.dumps(value)}\n" for key, value in sim.items())
-    return f'robot = "{name}"\nclock = "sim"\nprocesses = {json.dumps(PROCESSES)}\n{mesh}\n[service.sim]\n{settings}'
+    return f'robot = "{name}"\nclock = "sim"\nprocesses = {json.dumps(processes)}\n{mesh}\n[service.sim]\n{settings}'

@@ -14,6 +14,7 @@ from cocoro.messages import (
     Detections,
     Intent,
     Message,
+    Motion,
     Obstacles,
     PlannerStatus,
     ServoCommand,
@@ -42,7 +43,13 @@ class Planner:
         self.hand_load = 0.0
         self.latch = "released"
         self.wants: Intent | None = idle()
+        self.motion: Motion | None = None
+        """What the operator's hand wants."""
         self.sees: tuple[float, float, float] | None = CAN_M
+        self.free: tuple[tuple[float, float, float], ...] = tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))
+        """Free floor: bearings, and distances from and to."""
+        self.points: tuple[tuple[float, float, float], ...] = ()
+        """Obstacles, body frame."""
         self.silent: set[str] = set()
         self.incarnation = 1
         self._count = 0
@@ -59,11 +66,17 @@ class Planner:
             wants = self.wants
             self._feed(
                 topics.INTENT,
-                Intent(task_id=wants.task_id, step=wants.step, action=wants.action),
+                Intent(
+                    task_id=wants.task_id,
+                    step=wants.step,
+                    action=wants.action,
+                    motion=self.motion,
+                    motion_until_ns=test.now_ns + round(0.2e9) if self.motion is not None else 0,
+                ),
             )
         if self._count % 2 == 0:
             self._feed(topics.DETECTIONS, self._seen())
-            self._feed(topics.OBSTACLES, Obstacles(free=tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))))
+            self._feed(topics.OBSTACLES, Obstacles(free=self.free, points_m=self.points))
         self._count += 1
         test.step()
         status = self.status

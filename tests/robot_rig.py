@@ -69,12 +69,12 @@ class RobotRig:
         self._clock = VirtualClock()
         self._clock_of = clock_of or (lambda _: self._clock)
         self._bus_of = bus_of or (lambda mesh, robot, _: NotedBus(mesh, robot))
-        self._robot = Robot.load()
-        self._robot.name = name or self._robot.name
+        self.robot = Robot.load()
+        self.robot.name = name or self.robot.name
         self.mesh = mesh or LocalMesh()
         self._services: dict[str, _Running] = {}
-        self.operator = Node("operator", self.mesh.join(), self._clock, self._robot)
-        self.tap = Tap(self.mesh.join(), self._robot.name)
+        self.operator = Node("operator", self.mesh.join(), self._clock, self.robot)
+        self.tap = Tap(self.mesh.join(), self.robot.name)
         if not record_steps:  # then nobody asks for them; those of a fetch are 70 MB
             self.tap.leave_out(topics.FRAME)
         self.truths: list[Truth] = []
@@ -103,9 +103,9 @@ class RobotRig:
         component = load(named(name))
         needed = {"needed": needs(name)} if name == "executive" else {}
         config = msgspec.convert(needed | dict(self._settings.get(name, {})), component.config)
-        bus = self._bus_of(self.mesh, self._robot.name, name)
+        bus = self._bus_of(self.mesh, self.robot.name, name)
         node = DelayedNode(
-            name, bus, self._clock_of(name), self._robot,
+            name, bus, self._clock_of(name), self.robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
         )  # fmt: skip
         await node.__aenter__()
@@ -218,7 +218,7 @@ class RobotRig:
     def turned_since(self, when_s: float) -> float:
         """True change of the body's heading since then, rad."""
         after = [truth for truth in self.truths if truth.stamp_ns >= when_s * NS]
-        first, last = (_yaw_rad(truth) for truth in (after[0], after[-1]))
+        first, last = (yaw_of(truth) for truth in (after[0], after[-1]))
         return abs(wrap_rad(last - first))
 
     def commanded_since(self, when_s: float) -> list[tuple[float, float]]:
@@ -242,6 +242,7 @@ class RobotRig:
         return set(self.thing(label).touching) == CLAWS
 
 
-def _yaw_rad(truth: Truth) -> float:
+def yaw_of(truth: Truth) -> float:
+    """The body's true heading, rad."""
     x, y, z, w = truth.body_orientation
     return atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -8,10 +8,12 @@ from cocoro.messages import Intent, TaskRequest
 from cocoro.messages.actions import ACTIONS, Action, Idle
 
 
-def asked(task: str, label: str = "", timeout_s: float | None = None, asker: str = "", **fields: Any) -> TaskRequest:
+def asked(
+    task: str, label: str = "", timeout_s: float | None = None, asker: str = "", instead: bool = False, **fields: Any
+) -> TaskRequest:
     """A request as it travels; a label only where one is given."""
     wire = {"task": task, **({"label": label} if label else {}), **fields}
-    return TaskRequest(task=wire, timeout_s=timeout_s, asker=asker)
+    return TaskRequest(task=wire, timeout_s=timeout_s, asker=asker, instead=instead)
 
 
 def action(name: str, label: str = "", **fields: Any) -> Action:

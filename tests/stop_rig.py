@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from apps.cli.stop_asking import Asking
+from cocoro.stop.asking import Asking
 
 PATIENCE_S = 60.0
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from places import in_short_folder
 
-from apps.cli import app, listed, stop_asking, task_commands, terminal
+from apps.cli import app, listed, task_commands, terminal
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
@@ -23,6 +23,7 @@ from apps.rehearsal import ahead
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.stop import asking
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
@@ -214,14 +215,14 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
     assert {name for name in modules if name.partition(".")[0] in PACKAGES} == {
-        "apps", "deploy", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
-        "apps.cli.stop_asking", "deploy.quit",
+        "apps", "cocoro", "deploy", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
+        "apps.cli.stop_result", "cocoro.stop", "cocoro.stop.asking", "deploy.quit",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
 
 
 def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
-    assert stoppable() == stop_asking.STOPPABLE
+    assert stoppable() == asking.STOPPABLE
 
 
 @pytest.mark.process

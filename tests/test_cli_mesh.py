@@ -18,7 +18,7 @@ import pytest
 from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
-from apps.cli.stop_asking import StopResult
+from apps.cli.stop_result import StopResult
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock

@@ -17,7 +17,7 @@ import pytest
 from apps.cli import estop, exits
 from apps.cli.estop import _left_open, _merged
 from apps.cli.main import main
-from apps.cli.stop_asking import StopResult
+from apps.cli.stop_result import StopResult
 from cocoro.stop.path import StopPoint, listen
 from deploy.rundir import RunDir
 
@@ -128,7 +128,7 @@ def test_a_site_that_cannot_be_read_is_told_in_a_line(services: Services, capsys
 def test_where_the_kernel_does_not_list_its_sockets_the_mesh_is_asked_and_that_is_said(
     services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("apps.cli.stop_asking.SOCKETS", "/nowhere/unix")
+    monkeypatch.setattr("cocoro.stop.asking.SOCKETS", "/nowhere/unix")
     assert main(["stop", "--robot", services.robot]) == exits.NO_MESH
     said = capsys.readouterr().err
     assert "the mesh alone was asked" in said

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from apps.cli.estop_mesh import ROUND_S
-from apps.cli.stop_asking import Asking
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import RealClock
@@ -21,6 +20,7 @@ from cocoro.latch import ServiceLatch
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState, ResetRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
+from cocoro.stop.asking import Asking
 from cocoro.stop.record import prepare, read
 
 ROBOT = Robot.load()

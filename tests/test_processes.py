@@ -10,7 +10,6 @@ import msgspec
 import pytest
 from operator_shell import install_parts
 
-from apps.cli import stop_asking
 from cocoro import topics
 from cocoro.component import Component
 from cocoro.component import load as load_component
@@ -18,6 +17,7 @@ from cocoro.entry_points import added_to
 from cocoro.errors import ConfigError
 from cocoro.installed import third_parties
 from cocoro.messages import Message
+from cocoro.stop import asking
 from cocoro.topics import REQUESTS, TOPICS, Topic
 from deploy import processes, profiles
 from deploy.processes import COMPONENTS
@@ -100,7 +100,7 @@ def test_a_component_that_moves_something_answers_the_emergency_stop() -> None:
 def test_hardware_and_what_the_emergency_stop_stops_are_derived() -> None:
     assert processes.hardware() == ("kinect", "base", "arm", "hand")
     assert processes.stoppable() == ("base", "arm", "hand")
-    assert processes.stoppable() == stop_asking.STOPPABLE  # which imports nothing, so it has its own
+    assert processes.stoppable() == asking.STOPPABLE  # which imports nothing, so it has its own
     assert {*processes.hardware()} == {*processes.named("sim").services}
 
 

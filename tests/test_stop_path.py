@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from stop_rig import PATIENCE_S, full_queue, new_robot, stop
 
-from apps.cli import stop_asking as asking_module
-from apps.cli.stop_asking import Asking, addresses
+from cocoro.stop import asking as asking_module
+from cocoro.stop.asking import Asking, addresses
 from cocoro.stop.path import PREFIX, StopPoint, listen
 
 ROOT = Path(__file__).parents[1]
@@ -56,9 +56,7 @@ def reached(asking: Asking) -> list[bool]:
 
 def another_user(robot: str, code: str) -> subprocess.Popen[str]:
     """Run Python code as nobody (user 65534) with an empty environment and `robot` as its argument."""
-    imports = (
-        f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from apps.cli.stop_asking import Asking;"
-    )
+    imports = f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from cocoro.stop.asking import Asking;"
     become = "os.setgroups([]); os.setgid(65534); os.setuid(65534);"
     command = [sys.executable, "-I", "-S", "-c", imports + become + code, robot]
     return subprocess.Popen(command, env={}, cwd="/", stdout=subprocess.PIPE, text=True)
@@ -302,7 +300,7 @@ def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str,
     code = (
         "import resource, time; hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1];"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (min(3000, hard), hard));"
-        "from apps.cli.stop_asking import Asking\nopen_files = []\n"
+        "from cocoro.stop.asking import Asking\nopen_files = []\n"
         "try:\n  while True: open_files.append(open('/dev/null'))\nexcept OSError: pass\n"
         "del open_files[-int(sys.argv[2]):]\n"
         "a = Asking(sys.argv[1]); a.go_on(time.monotonic() + 60)\n"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from apps.cli import doctor, stop_asking
-from cocoro.stop import record
+from apps.cli import doctor
+from cocoro.stop import asking, record
 from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
 
 PATIENCE_S = 60.0
@@ -225,6 +225,6 @@ def test_the_doctor_warns_of_a_place_that_does_not_outlive_a_reboot_or_cannot_be
 
 
 def test_the_doctor_says_when_the_kernels_list_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_asking, "SOCKETS", "/nowhere/unix")
+    monkeypatch.setattr(asking, "SOCKETS", "/nowhere/unix")
     path, _ = doctor.stop_checks("robbie")
     assert (path.state, "is /proc mounted?" in path.text) == ("bad", True)

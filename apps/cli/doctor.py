@@ -19,7 +19,6 @@ import typer
 from apps.cli import exits
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
 from apps.cli.output import print_json
-from apps.cli.stop_asking import addresses
 from apps.cli.terminal import folded
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
@@ -27,6 +26,7 @@ from cocoro.component import Component, load, machine_checks
 from cocoro.errors import ConfigError
 from cocoro.held_file import Holder
 from cocoro.robot import Robot
+from cocoro.stop.asking import addresses
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
 from deploy import extras, profiles

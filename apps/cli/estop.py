@@ -12,7 +12,8 @@ from typing import TextIO
 
 from apps.cli import exits, output
 from apps.cli.output import recent_complaints
-from apps.cli.stop_asking import STOPPABLE, Asking, Point, StopResult, movers_first
+from apps.cli.stop_result import StopResult
+from cocoro.stop.asking import STOPPABLE, Asking, Point, movers_first
 
 EXECUTIVE = "executive"
 """The executive ends its task at a stop. It moves nothing itself, so the command does not wait for its answer."""

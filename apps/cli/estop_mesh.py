@@ -10,12 +10,13 @@ from dataclasses import replace
 
 import msgspec
 
-from apps.cli.stop_asking import STOPPABLE, StopResult, movers_first
+from apps.cli.stop_result import StopResult
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError
 from cocoro.keys import alive_key, service_of
 from cocoro.messages import EstopReply, EstopRequest
+from cocoro.stop.asking import STOPPABLE, movers_first
 from cocoro.topics import ESTOP
 from deploy.rundir import RunDir, robots
 

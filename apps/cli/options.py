@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import completions
-from apps.cli.choice import RobotChoice as RobotChoice
+from apps.client.choice import RobotChoice as RobotChoice
 from cocoro.errors import ConfigError, choice_of
 
 
@@ -43,6 +43,9 @@ ThroughOption = Annotated[
 ]
 
 
+InsteadOption = Annotated[
+    bool, typer.Option("--instead", help="End the running task first; without, a robot that is busy refuses.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 SiteOption = Annotated[

@@ -24,9 +24,9 @@ from apps.cli import exits
 from apps.cli.estop import by_path
 from apps.cli.foxglove_door import Door, hidden_address
 from apps.cli.interrupt import interrupt_event
-from apps.cli.link import MeshLink, joined, through_site
 from apps.cli.options import RobotChoice
 from apps.cli.viewed import PER_SERVICE, Waiting, watch
+from apps.client.link import MeshLink, joined, through_site
 from cocoro.bus.base import Handle
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import CancelRequest, EstopRequest, TaskRequest

@@ -19,6 +19,7 @@ from cocoro.messages.common import (
     LatchState,
     Message,
 )
+from cocoro.messages.driving import DriveReply, DriveRequest, Motion
 from cocoro.messages.executive import (
     CancelRequest,
     KnownObject,
@@ -28,8 +29,12 @@ from cocoro.messages.executive import (
     Phase,
     RefusalCode,
     ReportRequest,
+    TaskKind,
+    TaskOption,
     TaskReply,
     TaskRequest,
+    TasksReply,
+    TasksRequest,
     TaskState,
 )
 from cocoro.messages.hardware import (
@@ -87,6 +92,8 @@ __all__ = [
     "Detection",
     "Detections",
     "DisturbedFile",
+    "DriveReply",
+    "DriveRequest",
     "EstopReply",
     "EstopRequest",
     "Exchange",
@@ -108,6 +115,7 @@ __all__ = [
     "Message",
     "ModelReply",
     "ModelRequest",
+    "Motion",
     "ObjectsReply",
     "ObjectsRequest",
     "Obstacles",
@@ -128,9 +136,13 @@ __all__ = [
     "ServoState",
     "StepRecord",
     "TargetEstimate",
+    "TaskKind",
+    "TaskOption",
     "TaskReply",
     "TaskRequest",
     "TaskState",
+    "TasksReply",
+    "TasksRequest",
     "TimeReply",
     "TimeRequest",
     "TopicHealth",

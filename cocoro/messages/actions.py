@@ -99,6 +99,10 @@ class GoTo(Action, frozen=True, tag="go-to"):
     """From the body's centre to the object's, over the floor, at the end."""
 
 
+class Drive(Action, frozen=True, tag="drive"):
+    """Do what the operator's hand wants now: the motion in the intent, while it counts. Has no end."""
+
+
 class GoThere(Action, frozen=True, tag="go-there"):
     """Drive to a place on the floor, the arm folded."""
 
@@ -134,7 +138,7 @@ def _brought() -> Iterator[type[Action]]:
 ACTIONS: Registry[Action] = Registry(
     "action",
     (
-        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, GoThere,
+        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, GoThere, Drive,
         BabbleArm, BabbleWheels,
     ),
     _brought,

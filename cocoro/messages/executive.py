@@ -33,8 +33,8 @@ class TaskState(Message):
     phases: tuple[Phase, ...] = ()
     outcome: Outcome | None = None
     reason: str = ""
-    """For failed and cancelled tasks: a word (not_found, lost, slipped, unreachable, timed_out, ...), a colon, and a
-    sentence."""
+    """For failed and cancelled tasks, and where it needs one for a task that is done: a word (not_found, lost, slipped,
+    unreachable, timed_out, ...), a colon, and a sentence."""
     elapsed_s: Finite = 0.0
     measures: dict[str, Finite] = {}
     """The task's own figures on how well it goes, by name; which ones is said where the task is described."""
@@ -48,6 +48,8 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     """None: the task's own limit."""
     asker: str = ""
     """When the liveliness token `<robot>/<asker>/asker` is gone, the task is cancelled. Empty: nobody is watched."""
+    instead: bool = False
+    """Cancel the running task, wait until the robot is at rest, then start this one. Without, it is refused as busy."""
 
 
 RefusalCode = Literal[
@@ -89,3 +91,41 @@ class KnownObject(msgspec.Struct, kw_only=True):
 
 class ObjectsReply(msgspec.Struct, kw_only=True):
     objects: tuple[KnownObject, ...]
+
+
+OptionType = Literal["bool", "int", "float", "str"]
+
+
+class TaskOption(msgspec.Struct, kw_only=True):
+    """A parameter of a task beside its label."""
+
+    name: str
+    type: OptionType
+    default: Any = None
+    needed: bool = False
+    """It has no default."""
+    description: str = ""
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class TaskKind(msgspec.Struct, kw_only=True):
+    """A task that the executive can run."""
+
+    name: str
+    doc: str = ""
+    """One paragraph."""
+    label: Literal["", "known", "graspable"] = ""
+    """Which objects its label may name; '' for a task without one."""
+    label_needed: bool = False
+    samples: bool = False
+    """It reports samples for learning, which somebody has to keep."""
+    options: tuple[TaskOption, ...] = ()
+
+
+class TasksRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class TasksReply(msgspec.Struct, kw_only=True):
+    tasks: tuple[TaskKind, ...]

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from cocoro.messages.actions import ACTIONS
 from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, FiniteVec3, Message
+from cocoro.messages.driving import Motion
 
 
 class Intent(Message):
@@ -20,6 +21,10 @@ class Intent(Message):
     task_id: str = ""
     step: Count = 0
     """Counts the intents of one run of the executive. The planner's status repeats the number that it answers."""
+    motion: Motion | None = None
+    """What the operator's hand wants now, for the action `drive`."""
+    motion_until_ns: int = 0
+    """The motion counts until then, on the robot's clock, whether or not another intent comes."""
 
     def __post_init__(self) -> None:
         self.action = ACTIONS.read(self.action)

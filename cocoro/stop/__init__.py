@@ -5,7 +5,7 @@ library.
 
 - `path`: the receiving side, in each process that moves something.
 - `record`: the latch on disk, which survives every process and a reboot.
-- `apps.cli.stop_asking`: the sending side.
+- `asking`: the sending side.
 
 Every user of the robot's machine may stop it. Only its owner may reset it, since a reset goes over the mesh, whose
 directory is the owner's alone.

@@ -25,13 +25,17 @@ from cocoro.messages import (
     ReportRequest,
     TaskReply,
     TaskRequest,
+    TasksReply,
+    TasksRequest,
     TaskState,
 )
 from cocoro.messages.actions import TASK_GROUP, Action
 from cocoro.node import Node
 from cocoro.objects import Catalogue
+from cocoro.task_table import described
 from cocoro.tasks import Task, TaskFailedError
 from services.executive.askers import Askers
+from services.executive.by_hand import ByHand
 from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
 from services.executive.recovery import Recovery
@@ -80,6 +84,8 @@ class Executive:
         node.serve(topics.CANCEL, self._cancel)
         node.serve(topics.REPORT, self._report)
         node.serve(topics.OBJECTS, self._objects)
+        node.serve(topics.TASKS, self._tasks)
+        ByHand(node, self._skills, lambda: self.state.task_id if self._runs else "", self._what_became_of, self._waits)
 
     async def settle(self) -> None:
         """Wait until it is known whether the emergency stop is latched, so that a robot that is up takes a task. Does
@@ -99,14 +105,18 @@ class Executive:
             task = TASKS.read(request.task)
         except ValueError as error:
             return TaskReply(accepted=False, refusal="bad_request", text=_with_faults(str(error)))
-        # All that follows happens at once, so that an asker who leaves after this finds his task running.
-        gone = bool(request.asker) and not await self._askers.present(request.asker)
-        if gone:
-            return TaskReply(accepted=False, refusal="asker_gone", text=GONE)
-        refusal = self._refusal(task)
-        if refusal is not None:
-            code, text = refusal
-            return TaskReply(accepted=False, refusal=code, text=text)
+        # What follows the last look at the asker happens at once: when he leaves after it, he finds his task running.
+        while True:
+            if request.asker and not await self._askers.present(request.asker):
+                return TaskReply(accepted=False, refusal="asker_gone", text=GONE)
+            refusal = self._refusal(task, instead=request.instead)
+            if refusal is not None:
+                code, text = refusal
+                return TaskReply(accepted=False, refusal=code, text=text)
+            if self._running is None:
+                break
+            self._end("cancelled", f"instead: the operator took the robot for {task.name}")
+            await asyncio.wait({self._running})
         self._count += 1
         now_ns = self._node.now_ns()
         task_id = f"{task.name}-{now_ns}-{self._count}"
@@ -121,8 +131,9 @@ class Executive:
         self._running = self._node.spawn(self._carry_out(task, timeout_s, self._ended))
         return TaskReply(accepted=True, task_id=task_id)
 
-    def _refusal(self, task: Task) -> tuple[RefusalCode, str] | None:
-        """The reason for which a task cannot start now: a code, and a sentence with advice; None when it can."""
+    def _refusal(self, task: Task, *, instead: bool) -> tuple[RefusalCode, str] | None:
+        """The reason for which a task cannot start now, or `instead` of the running one: a code, and a sentence with
+        advice; None when it can."""
         if task.needs_label:
             known = self._catalogue.get(task.target)
             grasping = task.needs_label == "graspable"
@@ -131,7 +142,7 @@ class Executive:
                 return "unknown_label", f"unknown object {task.target!r}; {choice_of(task.target, targets)}"
             if grasping and not known.graspable:
                 return "not_graspable", f"{task.target} does not fit into the hand; what does: {', '.join(targets)}"
-        if self._running is not None:
+        if self._running is not None and not instead:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if stopped := self._estop.refusal:
             return "estop", stopped
@@ -189,6 +200,9 @@ class Executive:
             )
         )
 
+    async def _tasks(self, _: TasksRequest) -> TasksReply:
+        return TasksReply(tasks=tuple(map(described, TASKS.all().values())))
+
     # --- the running task -------------------------------------------------------------------------
 
     async def _carry_out(self, task: Task, timeout_s: float, ended: asyncio.Future[Ending]) -> None:
@@ -220,11 +234,11 @@ class Executive:
         await self._come_to_rest()
         self._finish(outcome, reason if isinstance(reason, str) else await reason)
 
-    def _outcome_of(self, work: asyncio.Future[None]) -> tuple[Outcome, str]:
+    def _outcome_of(self, work: asyncio.Future[str | None]) -> tuple[Outcome, str]:
         """Outcome and reason of a routine that has ended."""
         error = work.exception()
         if error is None:
-            return "done", ""
+            return "done", work.result() or ""
         if isinstance(error, TaskFailedError):
             return "failed", str(error)
         self._node.log.error("task %s failed", self.state.task_id, exc_info=error)
@@ -282,6 +296,19 @@ class Executive:
     def _runs(self) -> bool:
         """Whether a task runs and nothing has ended it yet."""
         return self._running is not None and self._ended is not None and not self._ended.done()
+
+    def _waits(self) -> str:
+        """Why the running task waits for a service; '' when it does not."""
+        return self._recovery.text if self._recovery is not None and self._runs else ""
+
+    def _what_became_of(self, task_id: str) -> str:
+        """What became of a task that does not run, for who goes on driving in it."""
+        state = next((state for state in (self.state, *self._over) if task_id and state.task_id == task_id), None)
+        if state is None:
+            return "no such task runs"
+        if state.outcome is None:
+            return f"{state.task} is ending"
+        return f"{state.task} has ended: {state.outcome}{f': {state.reason}' if state.reason else ''}"
 
     def _on_step(self, action: Action) -> None:
         if self._recovery is not None:
@@ -344,8 +371,7 @@ class Executive:
             state.elapsed_s = self._elapsed_s()
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
-            waits = self._recovery.text if self._recovery is not None and self._runs else ""
-            state.text = waits or self._skills.waits or state.text
+            state.text = self._waits() or self._skills.waits or state.text
         state.stamp_ns = self._node.now_ns()
         self._publisher.put(state)
 

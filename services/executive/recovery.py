@@ -19,6 +19,7 @@ from cocoro.messages.actions import (
     BabbleArm,
     BabbleWheels,
     Carry,
+    Drive,
     Follow,
     GoTo,
     PutDown,
@@ -56,7 +57,7 @@ class Policy(NamedTuple):
 
 
 POLICIES = (
-    Policy(("perception", "kinect"), (PutDown,), "on"),
+    Policy(("perception", "kinect"), (PutDown, Drive), "on"),  # by hand: arm and head move, the wheels stand
     # The count of draws and trials, and the place under the hand, were in the planner that died.
     Policy(("planning",), (Touch, BabbleArm, BabbleWheels), "never"),
     Policy((), (Approach, GoTo, Follow), "find"),

@@ -7,13 +7,14 @@ from collections.abc import Callable
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.messages import Intent, PlannerStatus
-from cocoro.messages.actions import Action, Approach, Carry, GoThere, Idle
+from cocoro.messages import DriveReply, Intent, Motion, PlannerStatus
+from cocoro.messages.actions import Action, Approach, Carry, Drive, GoThere, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Limits, TaskFailedError
 from cocoro.units import Vec2, Vec3
 from services.executive.config import ExecutiveConfig
+from services.executive.deadman import Deadman, Moment
 from services.executive.tasks.steps import find
 
 LOOSE_S = 0.5
@@ -75,6 +76,8 @@ class PlannerSkills:
         self.intent = Intent(action=Idle())
         self.measures: dict[str, float] = {}
         """The running task's."""
+        self._deadman = Deadman(1, self._now())
+        """The running task's."""
         node.spawn(self._repeat(config.intent_hz))
 
     @property
@@ -121,6 +124,7 @@ class PlannerSkills:
         """Forget the task before, and have the planner stand still for this one."""
         self.measures = measures
         self._begun_by = None
+        self._deadman = Deadman(self._deadman.next_tick, self._now())
         self.stop(task_id)
 
     def stop(self, task_id: str) -> None:
@@ -150,11 +154,25 @@ class PlannerSkills:
         self.paused, self._interrupted, self._went_on_s = False, True, self.now_s()
         self.want(Idle(), self.intent.task_id)  # until the step begins anew
 
+    def _now(self) -> Moment:
+        return Moment(asyncio.get_running_loop().time(), self._node.now_ns())
+
+    def input(self, tick: int, motion: Motion, why_not: str) -> DriveReply:
+        """Take an operator's motion, as `Deadman.take`, and have the planner know at once what counts now."""
+        reply = self._deadman.take(tick, motion, self._now(), why_not)
+        if reply.accepted:
+            self._publish()
+        return reply
+
+    def since_input_s(self) -> float:
+        return self._deadman.since_input_s(self._now())
+
     def _publish(self) -> None:
         wanted = self.intent
-        self._publisher.put(
-            Intent(task_id=wanted.task_id, step=wanted.step, action=Idle() if self.paused else wanted.action)
-        )
+        intent = Intent(task_id=wanted.task_id, step=wanted.step, action=Idle() if self.paused else wanted.action)
+        if isinstance(intent.action, Drive) and (driven := self._deadman.motion(self._now())) is not None:
+            intent.motion, intent.motion_until_ns = driven
+        self._publisher.put(intent)
 
     async def _repeat(self, rate_hz: float) -> None:
         async for _ in self._node.every(rate_hz, "intent"):

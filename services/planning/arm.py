@@ -25,6 +25,8 @@ _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
+_SLOWEST_RADPS = 0.02
+"""Of a joint that moves: 0 would hold it."""
 _ASTRAY_RAD = 0.6
 """A pitch error above this occurs only after babbling."""
 
@@ -55,6 +57,7 @@ class ArmController:
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
         """Clearance of the reference, if it is known."""
+        self._measured: FloatArray = np.zeros(len(ARM))
 
     @property
     def reference(self) -> dict[str, float] | None:
@@ -65,6 +68,7 @@ class ArmController:
         """Start from the measured angles at the next step, because the arm was moved or stopped otherwise."""
         self._reference = None
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
         self._clearance_m = None
 
     def undelivered(self) -> None:
@@ -114,9 +118,10 @@ class ArmController:
         dt_s: float,
         *,
         swing_radps: float | None = None,
+        roll_rad: float | None = None,
     ) -> ArmStep:
         """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first. It swings to the
-        front at `swing_radps` or, by default, as fast as it may."""
+        front at `swing_radps` or, by default, as fast as it may. `roll_rad`: the wrist's at the pose; None: level."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
@@ -132,7 +137,7 @@ class ArmController:
             stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
-            return self._cartesian(goal, speed_mps, dt_s)
+            return self._cartesian(goal, speed_mps, dt_s, roll_rad)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
         return self._joints(stage, dt_s, swing_radps if "arm_base" in stage else None)._replace(
             arrived=False, left=left_m
@@ -169,6 +174,7 @@ class ArmController:
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         self._lagged_s = self._lagged_s + dt_s if lags else 0.0
+        self._measured = np.array([measured[name] for name in ARM])
         return self._reference
 
     @property
@@ -189,7 +195,7 @@ class ArmController:
             trial[name] += scale * gap
         return self._commit(trial, widest * (1 - scale), dt_s, arrived=widest * (1 - scale) < 0.02)
 
-    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> ArmStep:
+    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float, roll_rad: float | None = None) -> ArmStep:
         assert self._reference is not None
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
@@ -199,7 +205,7 @@ class ArmController:
         for name in ARM:
             change = trial[name] - self._reference[name]
             trial[name] = self._reference[name] + min(max(change, -limit), limit)
-        roll_gap = self._roll_rad - self._reference[ROLL]
+        roll_gap = (self._roll_rad if roll_rad is None else roll_rad) - self._reference[ROLL]
         trial[ROLL] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
@@ -218,6 +224,9 @@ class ArmController:
         moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
         # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
+        if self._lagged_s > 0.0:  # all joints arrive at once, so that the hand stays on its way
+            gaps = np.abs(goal - self._measured)
+            speed = np.maximum(gaps * (speed.max() / gaps.max()), _SLOWEST_RADPS)
         self._reference = trial
         self._clearance_m = before_m if blocked or waits else clearance_m
         return ArmStep(goal, speed, trial[ROLL], left, arrived and not (blocked or waits), blocked)

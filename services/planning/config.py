@@ -187,6 +187,38 @@ class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Positive = 25.0
 
 
+class ByHandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Driving by hand. Base and turn have the limits of `NavigationConfig`."""
+
+    unseen_mps: Positive = 0.12
+    """Over floor that was never seen."""
+    crawl_mps: Positive = 0.08
+    """Backwards, where the camera sees nothing."""
+    arm_out_mps: Positive = 0.28
+    """With the arm unfolded."""
+    just_been_s: Positive = 60.0
+    """The robot may back over floor on which it stood in this time, though no picture has shown it."""
+    hand_mps: Positive = 0.20
+    hand_radps: Positive = 0.5
+    """Of the hand about the arm's axis."""
+    roll_radps: Positive = 1.5
+    radius_m: tuple[float, float] = (0.30, 0.60)
+    azimuth_rad: tuple[float, float] = (-1.4, 0.55)
+    """Further to the left the arm is in the plane that it parks in."""
+    height_m: tuple[float, float] = (0.03, 0.60)
+    lead_m: Positive = 0.02
+    lead_rad: Positive = 0.06
+    """The wanted pose is at most so far ahead of the commanded one, so that the hand stops with the operator's."""
+    hull_m: Positive = 0.02
+    """Least distance of the unfolded arm from obstacles while the base moves."""
+    low_m: Positive = 0.20
+    """Parts of the arm that are lower do not pass over known objects."""
+    head_radps: Positive = 1.5
+    head_lead_rad: Positive = 0.25
+    look_after_s: Positive = 2.0
+    """So long after the operator moved the head it looks by itself at unseen floor ahead."""
+
+
 class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Correction of the reach by the sight of the own hand."""
 
@@ -226,6 +258,7 @@ class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm: ArmConfig = ArmConfig()
     hand: HandConfig = HandConfig()
     follow: FollowConfig = FollowConfig()
+    by_hand: ByHandConfig = ByHandConfig()
     blind_periods: Positive = 2.0
     """The robot drives on without news of perception for this many of perception's own periods where that is longer
     than `Base.command_timeout_s`, so that a slow perception does not stop it."""

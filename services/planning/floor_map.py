@@ -262,7 +262,10 @@ class FloorMap:
     def add_discs(self, cells: BoolArray, discs: Sequence[tuple[float, float, float]]) -> BoolArray:
         """The cells (SIZE, SIZE) with discs (x, y, radius), odometry frame, metres, added."""
         for x, y, radius in discs:
-            cells = cells | self._disc(x, y, radius)
+            disc = self._disc(x, y, radius)
+            if not disc.any() and (cell := self.cell(x, y)) is not None:
+                disc[cell] = True  # a thin thing may stand between the centres of all cells
+            cells = cells | disc
         return cells
 
     def _disc(self, x_m: float, y_m: float, radius_m: float) -> BoolArray:

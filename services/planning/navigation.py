@@ -113,9 +113,13 @@ class Driver:
             poses.append(poses[-1].compose(Pose2(speed * PREVIEW_S, 0.0, turn * PREVIEW_S)))
         return poses
 
-    def stopping_poses(self, speed_mps: float, turn_radps: float) -> list[Pose2]:
-        """The poses, in the present body frame, while the robot reacts and stops."""
+    def stopping_poses(self, speed_mps: float, turn_radps: float, *, turning: bool = False) -> list[Pose2]:
+        """The poses, in the present body frame, while the robot reacts and stops; with `turning` until a gentle turn
+        has ended, too."""
         time_s = _REACTION_S + _BRAKING_SHARE * abs(speed_mps) / self._config.acceleration_mps2
+        if turning:
+            turn_s = _BRAKING_SHARE * abs(turn_radps) / (GENTLE * self._config.turn_acceleration_radps2)
+            time_s = max(time_s, _REACTION_S + turn_s)
         steps = max(2, round(time_s / 0.08))
         poses = [Pose2()]
         for _ in range(steps):

@@ -16,7 +16,8 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
-from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState
+from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Motion, Obstacles, ServoState
+from cocoro.messages.driving import HOLD_S
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -353,6 +354,13 @@ class StateEstimator:
         if self.intent is None or not is_fresh(self.intent.stamp_ns, now_ns, topics.INTENT.max_age_s):
             return None
         return self.intent
+
+    def motion(self, now_ns: int) -> Motion | None:
+        """What the operator's hand wants now; None when nothing of it counts any more."""
+        intent = self.fresh_intent(now_ns)
+        if intent is None or intent.motion is None:
+            return None
+        return intent.motion if now_ns < min(intent.motion_until_ns, intent.stamp_ns + round(HOLD_S * NS)) else None
 
     def angles(self) -> Mapping[str, float]:
         """Every joint's newest measured angle, rad."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from cocoro.tasks import Task, registry
 from services.executive.tasks.arm import ParkTask, PutDownTask
 from services.executive.tasks.babble import BabbleArmTask, BabbleWheelsTask
+from services.executive.tasks.drive import DriveTask
 from services.executive.tasks.fetch import FetchTask
 from services.executive.tasks.follow import FollowTask
 from services.executive.tasks.go_there import GoThereTask
@@ -12,7 +13,8 @@ from services.executive.tasks.go_to import GoToTask
 from services.executive.tasks.touch import TouchTask
 
 TASKS = registry(
-    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, BabbleArmTask, BabbleWheelsTask)
+    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, DriveTask, BabbleArmTask,
+     BabbleWheelsTask)
 )  # fmt: skip
 """All tasks by name, third parties' included."""
 
@@ -20,6 +22,7 @@ __all__ = [
     "TASKS",
     "BabbleArmTask",
     "BabbleWheelsTask",
+    "DriveTask",
     "FetchTask",
     "FollowTask",
     "GoThereTask",

@@ -10,6 +10,7 @@ from cocoro.messages import actions
 from cocoro.messages.actions import Action
 from services.planning.behaviours.babbling import ArmBabbling, WheelBabbling
 from services.planning.behaviours.base import Actuators, Behaviour, Plan, Snapshot
+from services.planning.behaviours.by_hand import DrivingByHand
 from services.planning.behaviours.driving import Approaching, Carrying
 from services.planning.behaviours.following import Following
 from services.planning.behaviours.going import Going
@@ -34,6 +35,7 @@ BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
     actions.Follow: Following,
     actions.Touch: Touching,
     actions.GoTo: Going,
+    actions.Drive: DrivingByHand,
     actions.GoThere: GoingThere,
     actions.BabbleArm: ArmBabbling,
     actions.BabbleWheels: WheelBabbling,

@@ -38,7 +38,7 @@ class BackOff:
         if base is not None and (base.bump_left or base.bump_right) and self._from is None:
             self._from = snapshot.body
             self._bumps += 1
-            snapshot.estimator.around.floor.bump(self._touched(snapshot, base))
+            snapshot.estimator.around.floor.bump(self.touched(snapshot, base))
         if self._from is None:
             return None
         if self._bumps > self.MAX_BUMPS:
@@ -51,7 +51,8 @@ class BackOff:
         return Plan(command, snapshot.still(), "the bumper touched something: backing off", head)
 
     @staticmethod
-    def _touched(snapshot: Snapshot, base: BaseState) -> list[tuple[float, float]]:
+    def touched(snapshot: Snapshot, base: BaseState) -> list[tuple[float, float]]:
+        """Where the pressed bumper touches something, odometry frame, m."""
         radius = snapshot.actuators.robot.base.chassis_diameter_m / 2 + 0.02
         bearings = [b for b, hit in ((0.6, base.bump_left), (-0.6, base.bump_right)) if hit]
         if base.bump_left and base.bump_right:

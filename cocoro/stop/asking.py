@@ -1,4 +1,4 @@
-"""Sends the emergency stop to everything that moves on this machine, and collects the answers.
+"""The sending side: sends the emergency stop to everything that moves on this machine, and collects the answers.
 
 The receiving side is `cocoro.stop.path`. Only light modules of the standard library are imported, so that the time from
 the start of the command to its first datagram is that of starting Python.
@@ -13,10 +13,8 @@ import select
 import struct
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing, suppress
-from typing import NamedTuple
-
-from apps.cli import exits
 
 STOPPABLE = ("base", "arm", "hand")
 """The services that move something: a copy of `deploy.processes.stoppable()`, which is slow to import. A test compares
@@ -53,46 +51,6 @@ def movers_first(service: str) -> tuple[int, str]:
     return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
 
 
-class StopResult(NamedTuple):
-    """Result of stopping one robot."""
-
-    robot: str
-    acknowledged: tuple[str, ...]
-    missing: tuple[str, ...]
-    """Services that run and did not acknowledge."""
-    absent: tuple[str, ...]
-    """Services that do not run."""
-    seconds: float
-    """Time from Enter until the last service had stopped what it moves."""
-    not_kept: tuple[str, ...] = ()
-    """Reasons why latches will not survive a restart."""
-    not_yet_kept: tuple[str, ...] = ()
-    """Services that have not reported whether their latch is on the disk."""
-    owner: int | None = None
-    """User id of the owner when it is another user's robot."""
-    latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
-    """Time at which each service stopped what it moves, ns of CLOCK_MONOTONIC; known by the stop path only."""
-
-    @property
-    def code(self) -> int:
-        if self.missing:
-            return exits.FAILED
-        return exits.DONE if any(service in STOPPABLE for service in self.acknowledged) else exits.NO_MESH
-
-    def __str__(self) -> str:
-        whose = "" if self.owner is None else f" (of user {self.owner})"
-        text = f"{self.robot}{whose}: stopped {', '.join(self.acknowledged) or 'nothing'} in {self.seconds:.2f} s"
-        if self.missing:
-            text += f"; NOT ACKNOWLEDGED by {', '.join(self.missing)}"
-        if self.absent:
-            text += f"; not there: {', '.join(self.absent)}"
-        if self.not_kept:
-            text += f"; A RESTART WILL FORGET IT: {', '.join(self.not_kept)}"
-        if self.not_yet_kept:
-            text += f"; not yet known to be on the disk: {', '.join(self.not_yet_kept)}"
-        return text
-
-
 class Point:
     """One address of the stop path. Raises ValueError for an address of another form."""
 
@@ -126,7 +84,11 @@ class Asking:
     Raises OSError where the kernel does not list its sockets (no /proc), or this process may open no socket.
     """
 
-    def __init__(self, robot: str | None = None, by: str = "operator") -> None:
+    def __init__(
+        self, robot: str | None = None, by: str = "operator", heard: Callable[[Point], None] | None = None
+    ) -> None:
+        """`heard` is called with each address when it has reported to be latched."""
+        self._heard = heard
         self.points: dict[str, Point] = {}
         """By address; new ones are added as they appear."""
         self._robot = robot
@@ -230,6 +192,8 @@ class Asking:
         about = rest.partition(" ")[2]
         if word == "latched" and about.isascii() and about.isdecimal() and point.latched_ns is None:
             point.latched_ns = int(about)
+            if self._heard is not None:
+                self._heard(point)
         elif word in ("kept", "unkept"):
             point.kept, point.why_not_kept, point.settled = word == "kept", about, True
         elif word == "keepless":
