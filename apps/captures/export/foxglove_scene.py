@@ -98,7 +98,7 @@ class FoxgloveScene:
         depth: bool = False,
         again_ns: int | None = None,
     ) -> None:
-        """`wanted`: whether anybody wants a topic; pictures and points that nobody wants are not made. `depth`: show
+        """`wanted`: whether anybody wants a topic; little of what nobody wants is made, and no picture. `depth`: show
         the depth image, too. `again_ns`: show what does not change again after so long, for viewers that come later.
         """
         self._robot = robot
@@ -123,14 +123,17 @@ class FoxgloveScene:
         elif isinstance(message, BaseState):
             self._posture.move(message)
             self._stands = message.speed_mps == 0.0 and message.turn_rate_radps == 0.0
-            yield Shown("/tf", fg.FrameTransforms(transforms=[self._body(at)]))
+            if self._wanted("/tf"):
+                yield Shown("/tf", fg.FrameTransforms(transforms=[self._body(at)]))
             if self._due("chassis", message.stamp_ns):
                 yield Shown("/robot/chassis", fg.SceneUpdate(entities=[self._chassis(at)]))
         elif isinstance(message, ServoState):
             self._posture.bend(message)
-            yield from self._links(at)
+            if self._wanted("/tf") or self._wanted("/robot/links"):
+                yield from self._links(at)
         elif isinstance(message, Detections):
-            yield Shown("/camera/annotations", self._annotations(at, message))
+            if self._wanted("/camera/annotations"):
+                yield Shown("/camera/annotations", self._annotations(at, message))
         elif isinstance(message, PlannerStatus):
             yield from self._plan(at, message)
         elif isinstance(message, FloorPlan):
@@ -138,7 +141,7 @@ class FoxgloveScene:
             yield Shown("/planned", fg.SceneUpdate(entities=[_way(at, message)]))
         elif isinstance(message, TaskState):
             yield from self._log(at, message)
-        elif isinstance(message, Truth):
+        elif isinstance(message, Truth) and self._wanted("/truth"):
             yield Shown("/truth", fg.SceneUpdate(entities=[self._true(at, message)]))
 
     def _due(self, what: str, stamp_ns: int) -> bool:
@@ -161,8 +164,9 @@ class FoxgloveScene:
             x, y, yaw_rad = self._map_from_odometry
             turn = geometry.about_z(yaw_rad)
             yield Shown("/tf", fg.FrameTransforms(transforms=[_transform(at, MAP, ODOMETRY, (x, y, 0.0), turn)]))
-        believed = [self._believed(at, known) for known in plan.known]
-        yield Shown("/believed", fg.SceneUpdate(entities=believed))
+        if self._wanted("/believed"):
+            believed = [self._believed(at, known) for known in plan.known]
+            yield Shown("/believed", fg.SceneUpdate(entities=believed))
 
     def _frame(self, frame: Frame) -> Iterator[Shown]:
         at = _time(frame.stamp_ns)
