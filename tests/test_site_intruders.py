@@ -86,7 +86,7 @@ class Scene(NamedTuple):
 def scene() -> Iterator[Scene]:
     if why := obstacle():
         pytest.skip(why)
-    with in_short_folder() as folder, lab(folder, sensors="ideal") as site, ExitStack() as stack:
+    with in_short_folder() as folder, lab(folder, processes=("sim",), sensors="ideal") as site, ExitStack() as stack:
         site.up()
         site.deliver(site.desk, (BRAIN,))  # stolen
         body, brain = (
