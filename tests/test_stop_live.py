@@ -24,6 +24,11 @@ pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 ROOT = Path(__file__).parents[1]
 SMALL = ("--frames", "160x120@10")
+PROCESSES = {
+    "sim": ["sim", "perception", "planning", "executive"],
+    "sim-wire": ["wire", "base", "servos", "perception", "planning", "executive"],
+}
+"""Those of each profile but the recorder, which has no part in a stop."""
 
 
 needs_namespaces = pytest.mark.skipif(bool(no_namespaces()), reason=f"no namespaces: {no_namespaces()}")
@@ -69,7 +74,9 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def up(shell: Shell, *options: str, profile: str = "sim") -> str:
-    done = shell("up", profile, "--detach", *SMALL, "--set", f'robot="{shell.run_dir.robot}"', *options)
+    settings = (f'robot="{shell.run_dir.robot}"', f"processes={json.dumps(PROCESSES[profile])}")
+    sets = [word for setting in settings for word in ("--set", setting)]
+    done = shell("up", profile, "--detach", *SMALL, *sets, *options)
     assert done.returncode == exits.DONE, done.stdout + done.stderr
     return done.stdout
 
