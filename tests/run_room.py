@@ -24,9 +24,11 @@ LARGE_MB = 400.0
 fixture of their file stay together: what it has started runs during all of them, and each job would start it again."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
-TWO_ROBOTS = ("test_faults_two_robots.py", "test_site_clocks.py", "test_site_hosts.py", "test_site_intruders.py")
-"""Files with two robots, or with one over several hosts."""
-TWO_ROBOTS_MB = 740.0
+TWO_ROBOTS_MB = {
+    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 640.0, "test_site_clocks.py": 400.0,
+    "test_site_intruders.py": 820.0,
+}  # fmt: skip
+"""Files with two robots, or with one over several hosts, and what their tests with `zenoh` may need."""
 URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
 
@@ -56,8 +58,8 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
 def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
     if known is not None and item.nodeid in known:
         return max(known[item.nodeid], LEAST_MB)
-    if item.path.name in TWO_ROBOTS and item.get_closest_marker("zenoh"):
-        return TWO_ROBOTS_MB
+    if item.path.name in TWO_ROBOTS_MB and item.get_closest_marker("zenoh"):
+        return TWO_ROBOTS_MB[item.path.name]
     marks = {mark.name for mark in item.iter_markers()}
     guesses = (
         GUESSED_MB if known is None else GUESSED_MB[:1]

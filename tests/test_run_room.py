@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from run_memory import LEAST_MB, MEMORY, RUNNING, WORKER, Watch
 from run_record import FOLDER
-from run_room import LARGE_MB, TWO_ROBOTS, Room, jobs_of
+from run_room import LARGE_MB, TWO_ROBOTS_MB, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
@@ -41,7 +41,7 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS[0]))
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", next(iter(TWO_ROBOTS_MB))))
     for folder in (None, tmp_path):
         jobs = jobs_of([*items, robot, robots], folder)
         assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
@@ -51,7 +51,7 @@ def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp
 
 
 def test_the_file_with_two_robots_is_there() -> None:
-    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS)
+    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS_MB)
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
