@@ -116,7 +116,11 @@ class Client:
 
     def flood(self, keys: list[str], bytes: int, count: int, hz: float = 0.0, payload: str = "") -> float:
         """Returns how many it sent in a second. It waits where its link does not take more."""
-        content = _bytes(payload) * (bytes // max(len(payload), 1)) if payload not in ("", RANDOM) else None
+        content = None
+        if payload not in ("", RANDOM):
+            content = zenoh.ZBytes(
+                _bytes(payload) * (bytes // max(len(payload), 1))
+            )  # held once, however many are sent
         begun_s = time.monotonic()
         for number in range(count):
             if hz and (ahead_s := begun_s + number / hz - time.monotonic()) > 0:
