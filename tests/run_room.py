@@ -20,8 +20,8 @@ from run_memory import LEAST_MB, MEMORY
 BUDGET_MB = 820.0
 """For what the tests that run at a time need. Pytest and its workers share 130 MB more."""
 LARGE_MB = 400.0
-"""The tests of a file that need more are a job of their own, so that the rest fits beside more. Those that share a
-fixture of their file stay together: what it has started runs during all of them, and each job would start it again."""
+"""The tests of a file that need more are a job of their own, so that the rest fits beside more. Not so where they share
+a fixture of their file: what it has started runs during all of them, and each job would start it again."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
 TWO_ROBOTS_MB = {
@@ -45,11 +45,13 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
     known: dict[str, float] | None = None
     if folder is not None and (file := folder / MEMORY).is_file():
         known = json.loads(file.read_text()).get("own_mb")
-    found: dict[tuple[Path, str], list[pytest.Item]] = defaultdict(list)
-    needs_mb: dict[tuple[Path, str], float] = defaultdict(float)
+    found: dict[tuple[Path, bool], list[pytest.Item]] = defaultdict(list)
+    needs_mb: dict[tuple[Path, bool], float] = defaultdict(float)
+    items = list(items)
+    whole = {item.path for item in items if _shares(item)}
     for item in items:
         need_mb = _need_mb(item, known)
-        part = item.path, "shares" if _shares(item) else "large" if need_mb > LARGE_MB else "small"
+        part = item.path, need_mb > LARGE_MB and item.path not in whole
         found[part].append(item)
         needs_mb[part] = max(needs_mb[part], need_mb)
     return [Job(of_part, needs_mb[part]) for part, of_part in found.items()]

@@ -77,14 +77,14 @@ def test_the_large_tests_of_a_file_are_a_job_of_their_own(tmp_path: Path) -> Non
     ]  # fmt: skip
 
 
-def test_tests_that_share_a_fixture_of_their_file_stay_together(tmp_path: Path) -> None:
-    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::first": LARGE_MB + 50}}))
+def test_a_file_whose_tests_share_a_fixture_is_one_job(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::first": LARGE_MB + 50, "b::large": LARGE_MB + 10}}))
     shared = {"robot": "session", "lab": "module"}
-    items = [item("a::first", fixtures=shared), item("a::alone", fixtures={"robot": "session"}), item("a::quick")]
-    items.append(item("a::later", fixtures=shared))
-    jobs = jobs_of(items, tmp_path)
+    whole = [item("a::first", fixtures=shared), item("a::apart"), item("a::later", fixtures=shared)]
+    parts = [item("b::large", fixtures={"robot": "session"}), item("b::quick")]
+    jobs = jobs_of([*whole, *parts], tmp_path)
     assert [(job.items, job.need_mb) for job in jobs] == [
-        ([items[0], items[3]], LARGE_MB + 50), (items[1:3], LEAST_MB),
+        (whole, LARGE_MB + 50), (parts[:1], LARGE_MB + 10), (parts[1:], LEAST_MB),
     ]  # fmt: skip
 
 
