@@ -165,6 +165,7 @@ class FakeCockpit:
             Route("/", self._page),
             Mount("/static", StaticFiles(directory=PAGE)),
             Route("/stop", self._stop, methods=["POST"]),
+            Route("/health", self._health),
             Route("/captures", self._captures),
             Route("/captures/{rest:path}", self._change, methods=["GET", "POST", "DELETE"]),
             WebSocketRoute("/live", self._live),
@@ -271,6 +272,9 @@ class FakeCockpit:
     async def _stop(self, request: Request) -> Response:
         self.note({"do": "posted", "path": request.url.path})
         return JSONResponse(await self.stop())
+
+    async def _health(self, _: Request) -> Response:
+        return JSONResponse({"robot": "calliope"})
 
     async def _captures(self, _: Request) -> Response:
         return JSONResponse({"captures": captures()})

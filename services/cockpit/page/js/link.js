@@ -2,6 +2,7 @@
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 3000;
 const ANSWER_MS = 8000;
+const WATCH_MS = 500;
 const SILENCE_MS = 2500;
 /** A state comes ten times a second; after so long without anything the connection counts as lost. */
 
@@ -17,7 +18,8 @@ export class Link {
     this.socket = null;
     this.heardMs = 0;
     this.ended = false;
-    this.watch = setInterval(() => this.#watch(), 500);
+    this.watchedMs = 0;
+    this.watch = setInterval(() => this.#watch(), WATCH_MS);
     this.open();
   }
 
@@ -112,7 +114,10 @@ export class Link {
   }
 
   #watch() {
-    if (document.hidden || !this.isOpen || performance.now() - this.heardMs < SILENCE_MS) return;
+    const nowMs = performance.now();
+    const frozen = nowMs - this.watchedMs > 2 * WATCH_MS; // what came meanwhile has not been looked at yet
+    this.watchedMs = nowMs;
+    if (frozen || document.hidden || !this.isOpen || nowMs - this.heardMs < SILENCE_MS) return;
     const socket = this.socket;
     socket.close(); // a dead network would let it wait for minutes
     this.#lost(socket, { code: 0, reason: "" });

@@ -129,7 +129,7 @@ function greet() {
   write(the("robot"), hello.robot);
   document.title = `${hello.robot} – CoCoRo`;
   map.bodyM = hello.body?.radius_m ?? map.bodyM;
-  view.quiet = new Set((hello.objects ?? []).filter((item) => !item.graspable).map((item) => item.label));
+  view.listed = map.listed = new Set((hello.objects ?? []).map((item) => item.label));
   captures.mayChange = hello.role === "operator";
   tasks.greet(hello);
   drive.greet(hello);

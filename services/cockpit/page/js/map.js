@@ -20,6 +20,7 @@ export class FloorMap {
     this.body = null;
     this.bodyM = 0.17;
     this.known = [];
+    this.listed = new Set();
     this.target = null;
     this.trail = [];
     this.viewM = 4.0;
@@ -57,7 +58,7 @@ export class FloorMap {
 
   /** Take the plan of a message `state`. */
   see(plan) {
-    this.known = plan?.known ?? [];
+    this.known = (plan?.known ?? []).filter((item) => this.listed.size === 0 || this.listed.has(item.label));
     this.target = plan?.target ?? null;
     this.body = plan?.body ?? null;
     if (this.body) {

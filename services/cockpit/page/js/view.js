@@ -17,7 +17,7 @@ export class View {
     this.aimed = null;
     this.drivingKeys = false;
     this.isPlay = false;
-    this.quiet = new Set();
+    this.listed = new Set();
     this.onPoint = onPoint;
     this.canvas.addEventListener("click", (event) => this.#click(event));
     this.canvas.addEventListener("pointermove", (event) => this.#hover(event));
@@ -128,7 +128,7 @@ export class View {
     const [right, bottom] = at([found.box[2] - 0.5, found.box[3] - 0.5]);
     const pad = 4 * unit;
     const aimed = this.aimed === found.label;
-    const quiet = this.quiet.has(found.label) && !aimed;
+    const quiet = this.listed.size > 0 && !this.listed.has(found.label) && !aimed;
     for (const [shade, width] of [["#000a", quiet ? 3 : 4.5], ["#ffffff", aimed ? 3.5 : quiet ? 1 : 2]]) {
       this.#line(context, shade, width * unit);
       context.beginPath();
