@@ -18,6 +18,7 @@ end      key                 undeclares all
 from __future__ import annotations
 
 import json
+import os
 import random
 import subprocess
 import sys
@@ -58,12 +59,17 @@ class Intruder:
         endpoint: str,
         ca: Path | None = None,
         more: Mapping[str, Any] | None = None,
+        *,
+        yields: bool = False,
     ) -> None:
         """`ca`: the authority that it trusts, without or instead of that of its credentials; `more`: zenoh's options,
-        by path."""
+        by path. `yields`: it takes only the processor time that the robot leaves, as it is on another machine in truth.
+        """
         argv = [sys.executable, "-m", "bench.intruder", credentials or NOTHING, endpoint, ca or NOTHING]
         argv.append(json.dumps(more or {}))
         self._process = host.run(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        if yields:
+            os.sched_setscheduler(self._process.pid, os.SCHED_IDLE, os.sched_param(0))
         self._lock = threading.Lock()
         self.refused: str = self._read()
 

@@ -72,6 +72,8 @@ class Component:
     hardware: bool = False
     """It drives a device that the simulator impersonates."""
 
+    optional: bool = False
+    """The robot works without it, so the hosts of a site may all leave it out."""
     settings: str = ""
     """The name of the `[service.NAME]` table that it is configured by, if that is not its own."""
     restart: Restart = "on-failure"

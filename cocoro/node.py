@@ -156,7 +156,7 @@ class Node(Participant):
 
     def inbox(self, topic: Topic[M], *, service: str | None = None) -> Inbox[M]:
         inbox = super().inbox(topic, service=service)
-        inbox.rejections.changed = self._publish_health_now
+        inbox.rejections.changed = self.report_health
         return inbox
 
     def watch_alive(self, handler: Callable[[str, bool], None], service: str = "*") -> Handle:
@@ -287,8 +287,9 @@ class Node(Participant):
             self._started_ns = now_ns if self._started_ns is None else self._started_ns
             self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns))
 
-    def _publish_health_now(self) -> None:
-        """A topic became unreadable, or can be read again; its reader reports that without delay."""
+    def report_health(self) -> None:
+        """Publishes the health now, besides once a second: for news that somebody waits for, such as that a topic
+        became unreadable."""
         now_ns = self.clock.now_ns()
         self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns or now_ns))
 

@@ -27,6 +27,8 @@ from cocoro.errors import ConfigError
 
 RUN_DIR = "COCORO_RUN_DIR"
 """Environment variable with the place of the run directory."""
+LOG_DIR = "COCORO_LOG_DIR"
+"""Environment variable with a place for the logs that outlives the run directory."""
 TEMPORARY = "/tmp"
 LINKS = 40
 """Links that are followed on one path; the kernel's own limit."""
@@ -218,6 +220,13 @@ def default_run_dir() -> Path:
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "cocoro"
     return Path(_place_for_temporary_files()) / f"cocoro-{os.getuid()}"
+
+
+def log_folder(robot: str, folder: Path) -> tuple[Path, str]:
+    """The folder of a robot's logs, one file for each process, where its run directory is `folder`; and the environment
+    variable that says where it is."""
+    elsewhere = os.environ.get(LOG_DIR)
+    return (Path(elsewhere) / robot, LOG_DIR) if elsewhere else (folder / "logs", RUN_DIR)
 
 
 def _place_for_temporary_files() -> str:

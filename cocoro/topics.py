@@ -105,6 +105,8 @@ class Request(Generic[Q, R]):
     """Questions and answers are published for recorders, unless this is False."""
     qos: Qos = Qos.COMMAND
     """Of question and answer."""
+    most_hz: float = 40.0
+    """How often a person's link to a site may ask it; what follows the last one sooner gets no answer."""
 
     @property
     def server(self) -> str:
@@ -186,6 +188,10 @@ PLAN = Topic(
     "What the planner does, and the reason. Beyond its age the running task fails.",
     shown=True,
 )  # fmt: skip
+FLOOR_PLAN = Topic(
+    "planning/map", m.FloorPlan, Qos.STATE, 2.0, 3.0,
+    "The floor as the planner knows it, and the way that it drives, for who looks on. Older ones are shown as old.",
+)  # fmt: skip
 HAND_SAMPLES = Topic(
     "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,
     "One sample of the arm's babbling: joint angles, and the position of the hand's marker at that time.",
@@ -241,7 +247,7 @@ RECORDING = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, OBSTACLES, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
+    DETECTIONS, OBSTACLES, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
     HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
 )  # fmt: skip
 
@@ -256,7 +262,7 @@ CANCEL = Request(
 DRIVE = Request(
     "executive/drive", m.DriveRequest, m.DriveReply,
     "One input of an operator who drives by hand; it moves the robot for at most 0.2 s.",
-    timeout_s=0.5,
+    timeout_s=0.5, most_hz=100.0,
 )  # fmt: skip
 REPORT = Request(
     "executive/report", m.ReportRequest, m.TaskState,
@@ -268,10 +274,15 @@ OBJECTS = Request(
     "The known objects, and where each was seen last.",
     right="see",
 )  # fmt: skip
+TASKS = Request(
+    "executive/tasks", m.TasksRequest, m.TasksReply,
+    "The tasks that can be asked for, each with its options.",
+    right="see",
+)  # fmt: skip
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch the emergency stop; answered by each service that moves something, and by the executive.",
-    timeout_s=1.0, right="stop",
+    timeout_s=1.0, right="stop", most_hz=200.0,
 )  # fmt: skip
 RESET = Request(
     "{service}/reset", m.ResetRequest, m.EstopReply,
@@ -306,12 +317,12 @@ ABOUT = Request(
 TIME = Request(
     "{service}/time", m.TimeRequest, m.TimeReply,
     "The robot's time on a host, from its gateway; hosts and persons compare their clocks by it.",
-    timeout_s=1.0, right="see", recorded=False,
+    timeout_s=1.0, right="see", recorded=False, most_hz=1000.0,
 )  # fmt: skip
 
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
 REQUESTS: tuple[Request[Any, Any], ...] = (
-    RUN, CANCEL, DRIVE, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
+    RUN, CANCEL, DRIVE, REPORT, OBJECTS, TASKS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
 )  # fmt: skip

@@ -18,6 +18,7 @@ from cocoro.topics import ANY, Topic
 from deploy.site.component import GATEWAY, PREFIX, gateway_of
 from services.base.component import BASE
 from services.capture.component import CAPTURE
+from services.cockpit.component import COCKPIT
 from services.executive.component import EXECUTIVE
 from services.frames.component import PACKER, UNPACKER, UNPACKER_PREFIX, unpacker_of
 from services.kinect.component import KINECT
@@ -32,7 +33,7 @@ SETTLED_S = 30.0
 """A process that has been ready for this long starts again without the waits of its earlier restarts."""
 
 COMPONENTS: tuple[Component, ...] = (
-    SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE, GATEWAY, PACKER, UNPACKER,
+    SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, COCKPIT, WIRE, GATEWAY, PACKER, UNPACKER,
 )  # fmt: skip
 """The project's own."""
 

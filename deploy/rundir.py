@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from cocoro.bus.endpoints import ZenohConfig
     from deploy.mesh_table import Mesh
 
-LOG_DIR = "COCORO_LOG_DIR"
-"""Environment variable with a place for the logs that outlives the run directory."""
 PROFILE_BYTES = 1024 * 1024
 """Upper bound of a profile's size."""
 KEPT_LOGS = 5
@@ -53,9 +51,7 @@ class RunDir:
         self.root = root or default_run_dir()
         self.path = self.root / robot
         self.profile_file = self.path / "profile.json"
-        elsewhere = os.environ.get(LOG_DIR)
-        self._log_variable = LOG_DIR if elsewhere else private.RUN_DIR
-        self.logs = Path(elsewhere) / robot if elsewhere else self.path / "logs"
+        self.logs, self._log_variable = private.log_folder(robot, self.path)
 
     def make(self) -> None:
         """Makes the folders. Raises ConfigError for one that cannot be made or is not this user's alone."""

@@ -27,6 +27,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
+from cocoro.topics import HEALTH
 from deploy import heartbeat, robot_time, service_manager
 from deploy.contact import SleepDetector
 from deploy.launch import CRASHED, Line
@@ -36,12 +37,15 @@ from deploy.quit import quit_process
 from deploy.rundir import RunDir
 from deploy.supervised_process import StartError, SupervisedProcess
 from deploy.survey import Onlooker, SurveyServer
+from services.cockpit.component import COCKPIT
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
 """Exit codes, as for every command."""
 COMES_UP_STOPPED = "the robot comes up stopped, and `cocoro reset` releases it"
 LEFTOVER_S = 8.0
 """Time in which the processes of a killed supervisor must notice that and end."""
+TOLD_TRIES, TOLD_S = 3, 0.3
+"""How often the cockpit is asked where its page is, and the longest wait for each answer."""
 
 log = logging.getLogger(__name__)
 
@@ -110,11 +114,12 @@ class Supervisor:
                         by_service[service].on_alive(service, alive)
 
                 bus.watch_alive(alive_key(self._profile.robot), on_alive)
-                survey = SurveyServer(Onlooker(self._run_dir, bus, private=not self._profile.shared))
+                onlooker = Onlooker(self._run_dir, bus, private=not self._profile.shared)
+                survey = SurveyServer(onlooker)
                 await survey.open()
                 detecting = asyncio.ensure_future(self._sleep_detector.keep())
                 try:
-                    code = await self._start_and_keep()
+                    code = await self._start_and_keep(onlooker)
                 finally:
                     detecting.cancel()
                     survey.close()
@@ -134,7 +139,7 @@ class Supervisor:
             self._report("the robot's time here is this machine's own: the host that keeps it did not answer")
         await asyncio.gather(*(child.start() for child in self._children if child not in first))
 
-    async def _start_and_keep(self) -> int:
+    async def _start_and_keep(self, onlooker: Onlooker) -> int:
         starting = asyncio.ensure_future(self._start())
         stopping = asyncio.ensure_future(self._stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -151,6 +156,7 @@ class Supervisor:
             return error.code
         if self._unshared:
             self._report(f"no shared memory: {self._unshared}; {shared.COSTS}")
+        await self._report_cockpit(onlooker)
         self._report(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
         service_manager.notify("READY=1")
@@ -163,6 +169,17 @@ class Supervisor:
             for task in keeping:
                 task.cancel()
         return STOPPED
+
+    async def _report_cockpit(self, onlooker: Onlooker) -> None:
+        """Say where the cockpit's page is, or why there is none."""
+        if COCKPIT.name not in self._profile.processes:
+            return
+        for _ in range(TOLD_TRIES):
+            told = await onlooker.newest(HEALTH.of(COCKPIT.name), TOLD_S)
+            if told and told[0].text:
+                self._report(f"{COCKPIT.name}: {told[0].text}")
+                return
+            await asyncio.sleep(TOLD_S / TOLD_TRIES)
 
     async def _feel_pulses(self) -> None:
         """Kill processes that hang, for ever."""

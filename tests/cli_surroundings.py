@@ -24,6 +24,7 @@ ARGUMENTS: dict[str, str] = {
     "follow": "{name}",
     "touch": "{name}",
     "go-to": "{name}",
+    "go-there": "--x 1 --y 0",
     "rehearse fetch": "{name} --seed -1",
     "snapshot": "{name}.png",
     "record": "--out {name}",

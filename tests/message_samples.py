@@ -10,7 +10,7 @@ import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from cocoro.messages import LARGEST, Frame, Intent, Message, ServoCommand, ServoState
+from cocoro.messages import LARGEST, FloorPlan, Frame, Intent, Message, ServoCommand, ServoState
 from cocoro.messages.actions import ACTIONS
 from cocoro.topics import REQUESTS, TOPICS
 
@@ -31,6 +31,8 @@ def _data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
     fields = _fields(inspect.type_info(kind))
     if issubclass(kind, Frame):
         return st.builds(_frame, fields, st.integers(1, 4), st.integers(1, 4))
+    if issubclass(kind, FloorPlan):
+        return st.builds(_floor_plan, fields, st.integers(0, 4), st.integers(0, 4))
     if issubclass(kind, Intent):
         actions = [_fields(inspect.type_info(each)) for each in ACTIONS.own.values()]
         return st.builds(_intent, fields, st.one_of(actions))
@@ -80,6 +82,10 @@ def _intent(fields: Data, action: Data) -> Data:
 def _frame(fields: Data, width: int, height: int) -> Data:
     pixels = width * height
     return fields | {"width": width, "height": height, "colour": bytes(3 * pixels), "depth": bytes(2 * pixels)}
+
+
+def _floor_plan(fields: Data, width: int, height: int) -> Data:
+    return fields | {"width": width, "height": height, "cells": bytes(width * height)}
 
 
 def _servos(kind: type[Message], fields: Data, joints: int) -> Data:

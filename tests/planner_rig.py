@@ -29,6 +29,8 @@ from services.planning.core import PlanningCore
 ROBOT = Robot.load()
 TICK_S = 0.02
 CAN_M = (1.5, 0.0, 0.06)
+SHOWN = {topics.PLAN.name, topics.FLOOR_PLAN.name}
+"""What it publishes that commands nothing."""
 
 
 class Planner:
@@ -103,7 +105,7 @@ class Planner:
     @property
     def commanded(self) -> set[str]:
         """The topics of the last step's commands."""
-        return {output.topic.name for output in self.under_test.steps[-1]} - {topics.PLAN.name}
+        return {output.topic.name for output in self.under_test.steps[-1]} - SHOWN
 
     def _feed(self, topic: Topic[Any], message: Message) -> None:
         if topic.name not in self.silent:

@@ -17,9 +17,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from apps.captures.export.files import file_name
 from apps.captures.info import report
-from apps.captures.player import Player
 from apps.captures.replay import played_keys
 from apps.cli.main import main
+from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture
 
 

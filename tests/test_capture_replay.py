@@ -12,11 +12,11 @@ import msgspec
 import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
-from apps.captures.player import AT_ONCE, FASTEST, Player
 from apps.captures.replay import Replay, heard_as, played_keys, refuse_if_alive, restarted, services_of, with_rate
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
+from cocoro.capture.player import AT_ONCE, FASTEST, Player
 from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
 from cocoro.core import Output, Sample, Schedule, Take

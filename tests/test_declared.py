@@ -25,6 +25,7 @@ from cocoro.testing import ServiceUnderTest, in_virtual_time, misdeclared
 from cocoro.topics import (
     ARM_STATE,
     BASE_STATE,
+    FLOOR_PLAN,
     FRAME,
     HAND_SAMPLES,
     HAND_STATE,
@@ -139,7 +140,9 @@ def test_the_simulator_behind_wires_speaks_as_it_declares() -> None:
 
 @in_virtual_time
 async def test_a_component_that_says_more_or_less_than_it_declares_is_found() -> None:
-    other = replace(PLANNING, reads=(*PLANNING.reads, TRUTH), serves=(), publishes=(PLAN,), calls=(RUN,), records=True)
+    other = replace(
+        PLANNING, reads=(*PLANNING.reads, TRUTH), serves=(), publishes=(PLAN, FLOOR_PLAN), calls=(RUN,), records=True
+    )
     async with ServiceUnderTest(other) as service:
         service.feed(INTENT, idle())
         await service.advance(0.1)

@@ -13,11 +13,12 @@ from cocoro.clock import VirtualClock
 from cocoro.errors import CallTimeoutError
 from cocoro.messages import Frame, PackedFrame, PackedRequest
 from cocoro.node import Node
+from cocoro.pace import LATE_S, PATIENCE, Pace
 from cocoro.robot import Robot
 from cocoro.topics import FRAME, PACKED, Request
 from cocoro.vloop import run_virtual
 from services.frames import packer, unpacker
-from services.frames.pace import LATE_S, LEVELS, PATIENCE, Level, Pace
+from services.frames.pace import LEVELS, Level
 from services.frames.packing import pack
 from services.frames.reader import PackedReader
 
@@ -152,7 +153,7 @@ def test_after_a_cut_the_first_frame_is_a_new_one() -> None:
 
 
 def test_a_level_that_was_too_much_is_tried_ever_more_rarely() -> None:
-    pace = Pace()
+    pace = Pace(LEVELS)
     tried = []
     for number in range(4000):
         took_s = 0.09 if pace.level == LEVELS[0] else 0.01

@@ -249,6 +249,26 @@ def test_an_arm_that_is_held_up_is_not_left_behind() -> None:
     assert lead.max() <= CONFIG.arm.lead_rad + 2.5 * TICK_S
 
 
+def test_while_states_are_late_the_goals_of_all_joints_wait_so_that_the_hand_stays_on_its_way() -> None:
+    controller = ArmController(ROBOT, CONFIG.arm, REACHER)
+    late = np.array([PARKED[name] for name in ARM])
+
+    def goals(seconds: float) -> FloatArray:
+        to = HandPose(0.37, 0.0, 0.2, CONFIG.arm.pitch_rad)
+        steps = [controller.reach(to, 0.25, PARKED, TICK_S) for _ in range(round(seconds / TICK_S))]
+        assert not any(step.blocked for step in steps)
+        gaps = np.abs(steps[-1].goal_rad - late)
+        assert steps[-1].speed_radps[gaps > 0.01] / gaps[gaps > 0.01] == pytest.approx(
+            steps[-1].speed_radps.max() / gaps.max()
+        ), "all joints arrive at once"
+        return np.array([step.goal_rad for step in steps])
+
+    waiting = goals(CONFIG.arm.wait_s)
+    assert CONFIG.arm.wait_rad < np.abs(waiting - late).max() <= CONFIG.arm.wait_rad + 2.5 * TICK_S
+    assert (waiting[-5:] == waiting[-1]).all()
+    assert not np.array_equal(goals(0.1)[-1], waiting[-1]), "what is held up for longer is no delay"
+
+
 def test_holding_holds_what_was_commanded_last() -> None:
     arm = Arm(dict(READY))
     arm.go(lambda: arm.controller.reach(HandPose(0.45, 0.0, 0.1, CONFIG.arm.pitch_rad), 0.25, arm.angles, TICK_S), 0.2)

@@ -60,7 +60,9 @@ def test_an_action_without_a_behaviour_never_reaches_the_planner(third_party: No
 
 @pytest.mark.parametrize("kind", TASKS.own.values(), ids=lambda kind: kind.tag())
 def test_a_task_goes_round_unchanged(kind: type[Task]) -> None:
-    task = TASKS.read({"task": kind.tag(), **({"label": "red_can"} if kind.needs_label else {})})
+    given = {"label": "red_can", "x_m": 1.0, "y_m": -2.0}
+    required = {field.name for field in msgspec.structs.fields(kind) if field.required}
+    task = TASKS.read({"task": kind.tag(), **{name: given[name] for name in required}})
     sent = msgspec.msgpack.encode(TaskRequest(task=task))
     assert TASKS.read(msgspec.msgpack.decode(sent, type=TaskRequest).task) == task
 
@@ -82,6 +84,8 @@ def test_every_action_has_a_behaviour() -> None:
             "fetch: unknown field 'brng'; known are label, bring; did you mean bring",
         ),
         ({"task": "go-to", "label": "red_can", "distance_m": 9.0}, "go-to: distance_m: .*<= 5"),
+        ({"task": "go-there", "x_m": 1.0}, "go-there: .*required field `y_m`"),
+        ({"task": "put-down", "x_m": 1.0}, "put-down: a place needs both x and y"),
         ({"task": "babble-arm", "count": "many"}, "babble-arm: count: Expected `int`"),
     ],
 )

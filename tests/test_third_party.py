@@ -18,7 +18,6 @@ import pytest
 from capture_rig import STILL, Room, all_of, record
 from third_party import NAME, forget_third_parties, install, on_path
 
-from apps.captures.player import Player
 from apps.captures.reexecute import reexecute
 from apps.captures.replay import Replay, played_keys
 from apps.cli.echo import read
@@ -26,6 +25,7 @@ from apps.cli.listening import takes_frames
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
+from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture
 from cocoro.component import Component, load
 from cocoro.errors import ConfigError

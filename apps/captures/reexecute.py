@@ -84,6 +84,7 @@ def reexecute(
     with origins(captures, service) as made:
         steps = steps_of(captures, service)
         run = _Reexecution(service, made, captures, tolerance if compare else None)
+        run.published = {name[0] for _, record in steps for name in record.produced}
         for step in with_messages(captures, steps):
             run.execute(step)
     result = run.result
@@ -109,6 +110,8 @@ class _Reexecution:
             if each.left_out
             for key in missing_of(each).left_out
         }
+        self.published: set[str] = set()
+        """The topics of all recorded outputs."""
         self._settled_ns = 0
         self._incarnation: int | None = None
         self._starts = 0
@@ -192,6 +195,7 @@ class _Reexecution:
         """Compare a step's outputs with the recorded ones: the reason for which they cannot be compared, and the first
         difference; each is '' when there is none."""
         produced = step.record.produced
+        outputs = [output for output in outputs if not self._is_new(output)]
         given, now = [name[0] for name in produced], [output.topic.name for output in outputs]
         if given != now:
             return "", f"it produced {', '.join(given) or 'nothing'} and now produces {', '.join(now) or 'nothing'}"
@@ -213,6 +217,15 @@ class _Reexecution:
             if text:
                 return "", f"{name[0]}: {text}"
         return "", ""
+
+    def _is_new(self, output: Output) -> bool:
+        """Whether an output is of a topic that the recorded version did not have. That is known of a topic with a rate
+        of its own: a version that has it publishes it in every run."""
+        topic = output.topic
+        if topic.rate_hz is None or topic.name in self.published:
+            return False
+        self.changed[f"{topic.name} is new: not compared"] = None
+        return True
 
     def _encoded(self, name: MessageId, output: Output, now_ns: int) -> bytes:
         """The payload as the node would have published it."""

@@ -15,9 +15,9 @@ from typing import Any
 
 import msgspec
 
-from apps.captures.player import Player
 from cocoro.bus.base import Bus, Handle, Qos, RawPublisher
 from cocoro.capture.former import todays_name, todays_payload
+from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError

@@ -22,6 +22,8 @@ def load(name: str) -> TyperCommand | TyperGroup:
     match name:
         case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
+        case "drive":
+            from apps.cli.drive import app
         case "status":
             from apps.cli.status_command import app
         case "objects":
@@ -58,6 +60,8 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.kinect import app
         case "site":
             from apps.cli.site import app
+        case "cockpit":
+            from apps.cli.cockpit import app
         case "pki":
             from apps.cli.pki import app
         case "doctor":

@@ -20,6 +20,7 @@ _SUMMARIES = {
     TASKS: {
         "cancel": "End the running task; the robot stands still.",
         "wait": "Follow a task to its end, and exit as its own command would have.",
+        "drive": "Drive by hand with the keys of this terminal: base, head, arm and claws.",
         "rehearse": "Try a task in simulation: the whole robot in one process, in virtual time.",
     },
     WATCH: {
@@ -33,13 +34,14 @@ _SUMMARIES = {
         "record": "Record what travels on the mesh into MCAP files, until Ctrl-C.",
         "replay": "Send a capture into the mesh again.",
         "export": "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments.",
-        "view": "Open Rerun on a capture, or live on the mesh.",
+        "view": "Open Rerun on a capture, or live on the mesh; or serve the robot to Foxglove.",
     },
     TOOLS: {
         "top": "Services and topics, live: cpu, memory, rates against nominal, ages; what was skipped, lost, rejected.",
         "echo": "Messages of a key, decoded, of any type; one that a reader would reject is marked with the reason.",
         "hz": "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds.",
         "logs": "Logs of the robot's processes on this machine since their start, merged by time.",
+        "cockpit": "Let persons into the cockpit from other machines; list them, end it.",
         "site": "Check the plan of several machines; show it, its steps and its rules.",
         "pki": "Issue, renew and revoke the certificates of a site; list them.",
         "new": "Write a component (`new service NAME`) or a task (`new task NAME`) from a template.",

@@ -43,6 +43,9 @@ ThroughOption = Annotated[
 ]
 
 
+InsteadOption = Annotated[
+    bool, typer.Option("--instead", help="End the running task first; without, a robot that is busy refuses.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 SiteOption = Annotated[

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import re
 import sys
-import termios
-import tty
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,14 +12,15 @@ import msgspec
 import typer
 
 from apps.captures.info import left_out_notes
-from apps.captures.player import Player
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
+from apps.cli.keyboard import LEFT, QUIT, RIGHT, keyboard
 from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
 from apps.cli.terminal import StatusLine
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
@@ -35,9 +31,6 @@ from deploy.survey import REPLAY
 SHOW_S = 0.1
 JUMP_S = 5.0
 FASTER = 1.25
-LEFT, RIGHT = ("\x1b[D", "\x1bOD"), ("\x1b[C", "\x1bOC")
-KEY = re.compile(r"\x1b[\[O][A-Z]|.", re.DOTALL)
-"""One key press; a read may return several when they come quickly, as from a key that is held down."""
 HELP = "space pauses, . steps, left and right 5 s, + and - rate, q ends"
 
 
@@ -152,7 +145,7 @@ async def _play(
     watch = bus.watch_alive(alive_key(name), on_alive)
     work = asyncio.ensure_future(replaying.run())
     with (
-        _keyboard(lambda text: _handle_key(text, player, replaying, end)) as has_keys,
+        keyboard(lambda text: _handle_key(text, player, replaying, end)) as has_keys,
         StatusLine() as line,
     ):
         if has_keys:
@@ -174,28 +167,6 @@ async def _play(
         )
 
 
-@contextmanager
-def _keyboard(pressed: Callable[[str], None]) -> Iterator[bool]:
-    """Calls `pressed` with each key's text while the context lasts; yields False when standard input is no terminal."""
-    if not sys.stdin.isatty():
-        yield False
-        return
-    fd, loop = sys.stdin.fileno(), asyncio.get_running_loop()
-    before = termios.tcgetattr(fd)
-    tty.setcbreak(fd)
-
-    def read() -> None:
-        for key in KEY.findall(os.read(fd, 32).decode(errors="replace")) or [""]:
-            pressed(key)
-
-    loop.add_reader(fd, read)
-    try:
-        yield True
-    finally:
-        loop.remove_reader(fd)
-        termios.tcsetattr(fd, termios.TCSADRAIN, before)
-
-
 def _handle_key(text: str, player: Player, replaying: Replay, end: asyncio.Event) -> None:
     now_s = asyncio.get_running_loop().time()
     if text == " ":
@@ -208,7 +179,7 @@ def _handle_key(text: str, player: Player, replaying: Replay, end: asyncio.Event
         player.change_rate(now_s, player.rate * FASTER)
     elif text == "-":
         player.change_rate(now_s, player.rate / FASTER)
-    elif text in ("q", "\x03", "\x04", ""):
+    elif text in QUIT:
         end.set()
     replaying.changed()
 

@@ -41,6 +41,7 @@ from cocoro.errors import CocoroError, ConfigError
 from deploy import extras, launch, profiles
 from deploy.profiles import Profile
 from deploy.rundir import RunDir, Target, robots, targets
+from services.cockpit.component import COCKPIT
 
 SENSORS, BODIES, REACHES = ("ideal", "real"), ("nominal", "worn"), ("learned", "rigid")
 ERRORS = "supervisor.err"
@@ -83,6 +84,7 @@ def up(
         bool,
         typer.Option("--unattended", help="No person is present: the robot's first start has the emergency stop set."),
     ] = False,
+    no_cockpit: Annotated[bool, typer.Option("--no-cockpit", help="Without the page in the browser.")] = False,
     site: SiteOption = None,
     host: Annotated[
         str | None,
@@ -96,6 +98,8 @@ def up(
         settings.insert(0, objects_of(objects))
     settings[:0] = model_of(model, reach, adapt)
     read = profiles.read(profile or "sim", settings) if host is None else share_of(profile, site, host, settings)
+    if no_cockpit:
+        read = without_cockpit(read)
     extras.require(f"cocoro up {profile or ''}".strip(), read.rows())
     if json and not detach:
         raise ConfigError("--json says when the robot is up, so it needs --detach")
@@ -133,6 +137,14 @@ def run(
 ) -> None:
     """Run one process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
     sys.exit(run_process(process, profile, set_ or []))
+
+
+def without_cockpit(profile: Profile) -> Profile:
+    """The profile without the process that serves the page. Raises ConfigError where nothing else is in it."""
+    left = tuple(name for name in profile.processes if name != COCKPIT.name)
+    if not left:
+        raise ConfigError(f"--no-cockpit: profile {profile.name} starts nothing else")
+    return msgspec.structs.replace(profile, processes=left)
 
 
 def share_of(profile: str | None, site: Path | None, host: str, settings: list[str]) -> Profile:

@@ -21,12 +21,14 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from apps.cli import completions
+from apps.cli.listed import COMMANDS
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
     CameraOption,
     DescriptionOption,
     FramesOption,
+    InsteadOption,
     JsonOption,
     LatencyOption,
     MeasuredOption,
@@ -44,6 +46,7 @@ from cocoro.tasks import Task
 from services.executive.tasks import TASKS
 
 PANEL = "Tasks"
+_NAMES = frozenset(row.name for row in COMMANDS)
 UNITS = {"_s": "SECONDS", "_m": "METRES", "_rad": "RADIANS", "_mps": "M/S"}
 """Metavar by the unit that a field's name ends with."""
 
@@ -66,6 +69,7 @@ def operate(
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
+    instead: InsteadOption = False,
     robot: RobotOption = None,
     site: ThroughOption = None,
     json: JsonOption = False,
@@ -74,7 +78,7 @@ def operate(
     from apps.cli import task_running
     from cocoro.messages import TaskRequest
 
-    choice, request = RobotChoice(robot, site), TaskRequest(task=task, timeout_s=timeout)
+    choice, request = RobotChoice(robot, site), TaskRequest(task=task, timeout_s=timeout, instead=instead)
     if not detach:
         sys.exit(asyncio.run(task_running.run(choice, request, json, snapshot)))
     if snapshot is not None:
@@ -149,18 +153,19 @@ def _text(path: Path | None) -> str | None:
 
 
 def task_names() -> list[str]:
-    """The tasks that are commands of their own. `cocoro babble` runs those of the project's tasks that report samples,
-    because it keeps the samples."""
-    return [name for name in TASKS.all() if not _is_babbling(name)]
+    """The tasks whose commands are made from their types. `cocoro babble` runs those of the project's tasks that report
+    samples, because it keeps the samples; `cocoro drive` reads keys."""
+    return [name for name in TASKS.all() if not _has_another(name)]
 
 
 def task_command(name: str) -> TyperCommand | None:
     """The command of a task; None for a name that is none."""
-    return _command(name, operate) if _is_known(name) and not _is_babbling(name) else None
+    return _command(name, operate) if _is_known(name) and not _has_another(name) else None
 
 
-def _is_babbling(name: str) -> bool:
-    return name in TASKS.own and TASKS.own[name].samples is not None
+def _has_another(name: str) -> bool:
+    """Whether a command in a file of its own runs the task."""
+    return name in TASKS.own and (TASKS.own[name].samples is not None or name in _NAMES)
 
 
 def _is_known(name: str) -> bool:
@@ -196,13 +201,13 @@ class RehearsalGroup(TyperGroup):
     """A command for each task."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return list(TASKS.all())
+        return [name for name in TASKS.all() if name not in _NAMES]  # nobody drives by hand in a rehearsal
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if _is_known(cmd_name):
+        if _is_known(cmd_name) and cmd_name not in _NAMES:
             return _command(cmd_name, rehearse)
         if ctx is not None and not ctx.resilient_parsing and not cmd_name.startswith("-"):
-            ctx.fail(f"There is no task {cmd_name!r}; {choice_of(cmd_name, TASKS.all())}")
+            ctx.fail(f"There is no task {cmd_name!r}; {choice_of(cmd_name, self.list_commands(ctx))}")
         return None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -29,8 +28,6 @@ __all__ = ["Answer", "MeshLink", "find", "joined"]
 PERCEPTION = "perception"
 """The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
-APART_S = 0.002
-"""Pause before a request to a site, whose gateways drop requests that follow each other too closely."""
 
 
 class MeshLink(Onlooker):
@@ -49,8 +46,6 @@ class MeshLink(Onlooker):
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
         if self._refusal is not None and (why := self._refusal(request.key(self.robot_name))):
             raise RefusedError(why)  # the gateway would drop it, and nobody would answer
-        if self._refusal is not None:
-            await asyncio.sleep(APART_S)
         return await super()._ask(request, question, timeout_s)
 
     def described(self) -> Robot:
@@ -136,6 +131,7 @@ async def joined(
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
         link = MeshLink(run_dir, bus, private=config.directory is not None, refusal=refusal)
+        link.paced = refusal is not None
         if refusal is not None and not await link.alive():
             why = "is it up there, or has your certificate been revoked?"
             raise MeshError(f"nothing of {link.robot} is heard at {config.where}: {why}")

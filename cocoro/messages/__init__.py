@@ -29,8 +29,12 @@ from cocoro.messages.executive import (
     Phase,
     RefusalCode,
     ReportRequest,
+    TaskKind,
+    TaskOption,
     TaskReply,
     TaskRequest,
+    TasksReply,
+    TasksRequest,
     TaskState,
 )
 from cocoro.messages.hardware import (
@@ -61,6 +65,7 @@ from cocoro.messages.node import (
 )
 from cocoro.messages.perception import Detection, Detections, Obstacles
 from cocoro.messages.planning import (
+    FloorPlan,
     HandSample,
     Intent,
     LearnedModel,
@@ -97,6 +102,7 @@ __all__ = [
     "FiniteQuaternion",
     "FiniteVec2",
     "FiniteVec3",
+    "FloorPlan",
     "Frame",
     "HandSample",
     "Health",
@@ -130,9 +136,13 @@ __all__ = [
     "ServoState",
     "StepRecord",
     "TargetEstimate",
+    "TaskKind",
+    "TaskOption",
     "TaskReply",
     "TaskRequest",
     "TaskState",
+    "TasksReply",
+    "TasksRequest",
     "TimeReply",
     "TimeRequest",
     "TopicHealth",

@@ -103,6 +103,13 @@ class Drive(Action, frozen=True, tag="drive"):
     """Do what the operator's hand wants now: the motion in the intent, while it counts. Has no end."""
 
 
+class GoThere(Action, frozen=True, tag="go-there"):
+    """Drive to a place on the floor, the arm folded."""
+
+    place_m: FiniteVec2
+    """Where the body's centre is to be at the end, odometry frame."""
+
+
 class BabbleArm(Action, frozen=True, tag="babble-arm"):
     """Move the arm from draw to draw and report where the hand is seen."""
 
@@ -131,7 +138,7 @@ def _brought() -> Iterator[type[Action]]:
 ACTIONS: Registry[Action] = Registry(
     "action",
     (
-        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, Drive,
+        Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, GoThere, Drive,
         BabbleArm, BabbleWheels,
     ),
     _brought,

@@ -91,3 +91,41 @@ class KnownObject(msgspec.Struct, kw_only=True):
 
 class ObjectsReply(msgspec.Struct, kw_only=True):
     objects: tuple[KnownObject, ...]
+
+
+OptionType = Literal["bool", "int", "float", "str"]
+
+
+class TaskOption(msgspec.Struct, kw_only=True):
+    """A parameter of a task beside its label."""
+
+    name: str
+    type: OptionType
+    default: Any = None
+    needed: bool = False
+    """It has no default."""
+    description: str = ""
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class TaskKind(msgspec.Struct, kw_only=True):
+    """A task that the executive can run."""
+
+    name: str
+    doc: str = ""
+    """One paragraph."""
+    label: Literal["", "known", "graspable"] = ""
+    """Which objects its label may name; '' for a task without one."""
+    label_needed: bool = False
+    samples: bool = False
+    """It reports samples for learning, which somebody has to keep."""
+    options: tuple[TaskOption, ...] = ()
+
+
+class TasksRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class TasksReply(msgspec.Struct, kw_only=True):
+    tasks: tuple[TaskKind, ...]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta
 
 from cocoro.messages.actions import ACTIONS
-from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Message
+from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, FiniteVec3, Message
 from cocoro.messages.driving import Motion
 
 
@@ -71,6 +72,31 @@ class PlannerStatus(Message):
     """All objects in memory."""
     model: str = ""
     """The body model that it reaches with: the rigid body and why, or the learned model and its error."""
+
+
+class FloorPlan(Message):
+    """What the planner knows of the floor, and the way that it drives on it, for who looks on. Odometry frame. The
+    rectangle is as large as what was seen; known objects are no part of it, `PlannerStatus.known` has them."""
+
+    cell_m: FiniteNonNegative
+    """Side of a cell."""
+    origin_m: FiniteVec2 = (0.0, 0.0)
+    """The corner of the first cell with the least x and y."""
+    width: Annotated[int, Meta(ge=0, le=240)] = 0
+    height: Annotated[int, Meta(ge=0, le=240)] = 0
+    """Cells along x, and along y; 0 while nothing was seen."""
+    cells: bytes = b""
+    """One byte each: 0 not seen, 1 free, 2 occupied. The cell (column, row) is number `row * width + column`; columns
+    count along x, rows along y. They are not packed: the result of packing depends on the library, and a step that is
+    executed again must give the same bytes everywhere."""
+    way_m: Annotated[tuple[FiniteVec2, ...], Meta(max_length=1024)] = ()
+    """Places of the way that it means to drive, from the robot on; empty when it has none."""
+    goal_m: FiniteVec2 | None = None
+    """The place that it drives to: of the object, or where the drive ends."""
+
+    def __post_init__(self) -> None:
+        if len(self.cells) != self.width * self.height:
+            raise ValueError(f"cells has {len(self.cells)} bytes, {self.width} x {self.height} needs as many cells")
 
 
 class LearnedModel(Message):

@@ -40,8 +40,9 @@ from deploy import profiles
 from deploy.processes import COMPONENTS, components, hardware, named
 from deploy.profiles import Name, Profile
 from deploy.site.component import GATEWAY, gateway_of
-from deploy.site.place import PLAN
+from deploy.site.place import CREDENTIALS, PLAN
 from deploy.site.roles import HostRole, PersonRole, Role
+from services.cockpit.component import COCKPIT
 from services.frames.component import PACKER, unpacker_of
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -50,6 +51,7 @@ AN_ENDPOINT = "an endpoint is written as tls/ADDRESS:PORT"
 
 
 LONGEST_HOST = 24
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class RobotRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -238,8 +240,17 @@ class Site:
             whole,
             robot=row.robot,
             processes=tuple(component.name for component in self.share(name)),
-            service={**whole.service, GATEWAY.name: settings},
+            service={**whole.service, GATEWAY.name: settings, **self._cockpit(whole, name)},
         )
+
+    def _cockpit(self, whole: Profile, name: str) -> dict[str, dict[str, Any]]:
+        """The table of a host's cockpit that is open to other machines: it shows the host's certificate and knows the
+        site's persons, where it says nothing else."""
+        given = whole.service.get(COCKPIT.name, {})
+        if given.get("host", LOOPBACK[0]) in LOOPBACK:
+            return {}
+        ours = {"site": str(self.folder), "credentials": str(self.folder / CREDENTIALS / name)}
+        return {COCKPIT.name: {**ours, **given}}
 
     def share(self, name: str) -> tuple[Component, ...]:
         """The components that run on a host: those of the plan, its gateway, and what carries frames between hosts,
@@ -392,7 +403,7 @@ def _foreign_key(component: Component) -> str:
 def _check_shares(site: Site, robot: str, profile: Profile, hosts: Mapping[str, HostRow]) -> None:
     for process in profile.processes:
         on = [name for name, host in hosts.items() if process in host.processes]
-        if len(on) != 1:
+        if len(on) != 1 and not (named(process).optional and not on):
             there = f"on {' and on '.join(on)}" if on else "on no host"
             raise ConfigError(f"[robot.{robot}]: process {process} runs {there}; give it to one host's processes")
     if len(hosts) > 1:

@@ -16,6 +16,7 @@ from cocoro.topics import (
     RUN,
     STOPS,
     TASK,
+    TASKS,
 )
 
 EXECUTIVE = Component(
@@ -24,7 +25,7 @@ EXECUTIVE = Component(
     doc="Runs the tasks: fetch, park, put-down; keeps the emergency stop's latch.",
     reads=(BASE_STATE, ARM_STATE, HAND_STATE, PLAN, HEALTH),
     publishes=(INTENT, TASK, LATCH),
-    serves=(RUN, CANCEL, DRIVE, REPORT, OBJECTS, *STOPS),
+    serves=(RUN, CANCEL, DRIVE, REPORT, OBJECTS, TASKS, *STOPS),
     needs=("base", "arm", "hand", "planning"),
     cpu_share=0.2,
 )

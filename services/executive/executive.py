@@ -25,11 +25,14 @@ from cocoro.messages import (
     ReportRequest,
     TaskReply,
     TaskRequest,
+    TasksReply,
+    TasksRequest,
     TaskState,
 )
 from cocoro.messages.actions import TASK_GROUP, Action
 from cocoro.node import Node
 from cocoro.objects import Catalogue
+from cocoro.task_table import described
 from cocoro.tasks import Task, TaskFailedError
 from services.executive.askers import Askers
 from services.executive.by_hand import ByHand
@@ -81,6 +84,7 @@ class Executive:
         node.serve(topics.CANCEL, self._cancel)
         node.serve(topics.REPORT, self._report)
         node.serve(topics.OBJECTS, self._objects)
+        node.serve(topics.TASKS, self._tasks)
         ByHand(node, self._skills, lambda: self.state.task_id if self._runs else "", self._what_became_of, self._waits)
 
     async def settle(self) -> None:
@@ -195,6 +199,9 @@ class Executive:
                 for known in self._catalogue.targets
             )
         )
+
+    async def _tasks(self, _: TasksRequest) -> TasksReply:
+        return TasksReply(tasks=tuple(map(described, TASKS.all().values())))
 
     # --- the running task -------------------------------------------------------------------------
 

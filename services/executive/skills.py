@@ -8,7 +8,7 @@ from collections.abc import Callable
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.messages import DriveReply, Intent, Motion, PlannerStatus
-from cocoro.messages.actions import Action, Approach, Carry, Drive, Idle
+from cocoro.messages.actions import Action, Approach, Carry, Drive, GoThere, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Limits, TaskFailedError
@@ -207,8 +207,8 @@ class PlannerSkills:
         self.measures[name] = round(value, 3)
 
     def _begin(self, action: Action) -> None:
-        if isinstance(action, Carry) and self._frame != self._begun_by:
-            raise TaskFailedError("not_alive", "base was restarted, so the place to carry it to is not known any more")
+        if isinstance(action, (Carry, GoThere)) and self._frame != self._begun_by:
+            raise TaskFailedError("not_alive", "base was restarted, so the place to go to is not known any more")
         self._phase(action.name)
         self._begins(action)
         self.want(action, self.intent.task_id)

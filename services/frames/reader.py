@@ -1,7 +1,7 @@
 """Fetches frames from the packer, one after the other: the next is asked for when the last has arrived.
 
 So at most one frame of a reader is on the way, and no queue of old ones can form, however slow the network is: who asks
-gets the newest. Each reader asks for the size that his own way carries (`services.frames.pace`); a slow viewer takes
+gets the newest. Each reader asks for the size that his own way carries (`cocoro.pace`); a slow viewer takes
 nothing from perception.
 """
 
@@ -13,8 +13,9 @@ from typing import Protocol
 
 from cocoro.errors import CallTimeoutError, CocoroError, RemoteError
 from cocoro.messages import Frame, PackedFrame, PackedRequest
+from cocoro.pace import Pace
 from cocoro.topics import PACKED, Request
-from services.frames.pace import LEVELS, Pace
+from services.frames.pace import LEVELS
 from services.frames.packing import unpack
 
 AGAIN_S = 0.2
@@ -36,7 +37,7 @@ class PackedReader:
 
     def __init__(self, asking: Asking, deliver: Callable[[Frame], None], *, best: bool = False) -> None:
         """`best`: pictures as good as they can be, however late they come."""
-        self.pace = Pace()
+        self.pace = Pace(LEVELS)
         self.trouble = "no frame has arrived yet"
         """Why no frame comes; '' when one has come."""
         self.refused = 0

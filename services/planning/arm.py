@@ -25,6 +25,8 @@ _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
+_SLOWEST_RADPS = 0.02
+"""Of a joint that moves: 0 would hold it."""
 _ASTRAY_RAD = 0.6
 """A pitch error above this occurs only after babbling."""
 
@@ -50,10 +52,12 @@ class ArmController:
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
         self._astray = False
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
         """Clearance of the reference, if it is known."""
+        self._measured: FloatArray = np.zeros(len(ARM))
 
     @property
     def reference(self) -> dict[str, float] | None:
@@ -64,6 +68,7 @@ class ArmController:
         """Start from the measured angles at the next step, because the arm was moved or stopped otherwise."""
         self._reference = None
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
         self._clearance_m = None
 
     def undelivered(self) -> None:
@@ -159,15 +164,24 @@ class ArmController:
         names = (*ARM, ROLL)
         if self._reference is None:
             self._reference = {name: measured[name] for name in names}
-        behind = False
+        behind = lags = False
         for name in names:
             lead = self._reference[name] - measured[name]
+            lags |= abs(lead) > self._config.wait_rad and name != ROLL
             if abs(lead) > self._config.lead_rad:
                 behind = True
                 self._clearance_m = None
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
+        self._lagged_s = self._lagged_s + dt_s if lags else 0.0
+        self._measured = np.array([measured[name] for name in ARM])
         return self._reference
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the goal stands until the joints are nearer to it. Commands or states are late then, and a joint that
+        lags alone would bring the hand off its way, down to the floor. What holds a joint up for longer is no delay."""
+        return 0.0 < self._lagged_s < self._config.wait_s
 
     def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
         """One step of the named joints to their goals; the others stay."""
@@ -203,12 +217,16 @@ class ArmController:
         clearance_m = self.clearance.of(trial)
         before_m = self._clearance_m if self._clearance_m is not None else self.clearance.of(self._reference)
         blocked = clearance_m < self._config.clearance_m and clearance_m < before_m - 1e-6
-        if blocked:
+        waits = self._waits
+        if blocked or waits:
             trial = self._reference
         goal = np.array([trial[name] for name in ARM])
         moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
         # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
+        if self._lagged_s > 0.0:  # all joints arrive at once, so that the hand stays on its way
+            gaps = np.abs(goal - self._measured)
+            speed = np.maximum(gaps * (speed.max() / gaps.max()), _SLOWEST_RADPS)
         self._reference = trial
-        self._clearance_m = before_m if blocked else clearance_m
-        return ArmStep(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)
+        self._clearance_m = before_m if blocked or waits else clearance_m
+        return ArmStep(goal, speed, trial[ROLL], left, arrived and not (blocked or waits), blocked)

@@ -153,6 +153,10 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A joint that lags behind its goal for this long is blocked."""
     lead_rad: Positive = 0.25
     """Largest lead of a joint's goal over its measured angle."""
+    wait_rad: Positive = 0.17
+    """The goals of all joints wait for one that lags by more: up to 0.15 rad are seen where nothing is late."""
+    wait_s: Positive = 0.5
+    """Longest wait: a link that lost a packet has repeated it by then."""
 
 
 class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

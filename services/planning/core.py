@@ -20,6 +20,7 @@ from cocoro.topics import Topic
 from services.planning.arm import ArmStep
 from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
 from services.planning.config import PlanningConfig
+from services.planning.floor_plan import FloorPlanner
 from services.planning.head import PAN, TILT
 from services.planning.learned import Learned
 from services.planning.reach import ARM
@@ -47,6 +48,7 @@ class PlanningCore:
         self._last_ns: int | None = None
         self._missing_since_ns: int | None = None
         self._head_goal: tuple[float, float] | None = None
+        self._floor_plan = FloorPlanner()
 
         self.learned = Learned(robot, config)
         if config.model:
@@ -78,6 +80,14 @@ class PlanningCore:
         return Schedule(self._config.rate_hz, (topics.DETECTIONS,))
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        around = self._estimator.around
+        around.way = None  # a course that is under way sets it anew
+        outputs = self._step(inputs, now_ns)
+        if self._floor_plan.due(now_ns):
+            return [*outputs, Output(topics.FLOOR_PLAN, self._floor_plan.made(around.floor, around.way))]
+        return outputs
+
+    def _step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
         for sample in inputs:
             if isinstance(sample.message, LearnedModel):
                 self.learned.take(bytes(sample.message.content))

@@ -20,6 +20,7 @@ from cocoro.frames import Pose2, wrap_rad
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.escape import Escape
+from services.planning.floor_plan import Way
 from services.planning.navigation import Driver, Offset, offset_to
 from services.planning.surroundings import Fields, Surroundings, placed
 
@@ -91,6 +92,8 @@ class Course:
         self._planned_ns: int | None = None
         self._stuck_since_ns: int | None = None
         self._last_stretch = False
+        self.walled = False
+        """The newest plan found no way: neither is the arc free nor is there a detour."""
         self._escape = Escape(self._body_m, self._config.clearance_m)
 
     def step(
@@ -106,6 +109,7 @@ class Course:
     ) -> Move:
         """One step towards a target (odometry frame). `folded`: the arm is not unfolded yet."""
         self._folded = folded
+        around.way = Way(target_m, np.empty((0, 2)))
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
@@ -124,6 +128,7 @@ class Course:
             move = Move(speed, turn, abs(offset.ahead_m), why, self._last_stretch)
         else:
             move, ahead = self._along(self._detour, body, fields, driver)
+        around.way = Way(target_m, ahead)
         return self._watch(move, ahead, body, around, fields, driver, now_ns)
 
     # --- planning ---------------------------------------------------------------------------------
@@ -144,12 +149,13 @@ class Course:
         free = self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields)
         if free and self._serves(preview[-1]):
             self._detour = None
-            self._last_stretch = True
+            self._last_stretch, self.walled = True, False
             return
         self._last_stretch = False
         if self._detour is not None and self._still_good(self._detour, fields, target_m):
             return
         self._detour = self._around(target_m, body, around, fields)
+        self.walled = self._detour is None
 
     def _free(self, poses: list[Pose2], fields: Fields, share: float, arm_from_m: float) -> bool:
         """Whether body and (over the last `arm_from_m`) hand pass all poses with this share of their margins."""

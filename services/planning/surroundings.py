@@ -13,6 +13,7 @@ from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
 from cocoro.units import Vec3
 from services.planning.floor_map import ClearanceField, FloorMap
+from services.planning.floor_plan import Way
 from services.planning.routes import Routes
 
 _KEEP_NS = NS // 10
@@ -37,6 +38,8 @@ class Surroundings:
         self._marker = marker
         self._radii_m = radii_m or {}
         self.floor = FloorMap()
+        self.way: Way | None = None
+        """The way of the course that is under way, for who looks on."""
         self._fields: Fields | None = None
         self._built: tuple[int, str] | None = None
         self._built_ns = 0

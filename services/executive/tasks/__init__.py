@@ -8,11 +8,13 @@ from services.executive.tasks.babble import BabbleArmTask, BabbleWheelsTask
 from services.executive.tasks.drive import DriveTask
 from services.executive.tasks.fetch import FetchTask
 from services.executive.tasks.follow import FollowTask
+from services.executive.tasks.go_there import GoThereTask
 from services.executive.tasks.go_to import GoToTask
 from services.executive.tasks.touch import TouchTask
 
 TASKS = registry(
-    (FetchTask, FollowTask, TouchTask, GoToTask, ParkTask, PutDownTask, DriveTask, BabbleArmTask, BabbleWheelsTask)
+    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, DriveTask, BabbleArmTask,
+     BabbleWheelsTask)
 )  # fmt: skip
 """All tasks by name, third parties' included."""
 
@@ -23,6 +25,7 @@ __all__ = [
     "DriveTask",
     "FetchTask",
     "FollowTask",
+    "GoThereTask",
     "GoToTask",
     "ParkTask",
     "PutDownTask",

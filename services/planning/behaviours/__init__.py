@@ -14,6 +14,7 @@ from services.planning.behaviours.by_hand import DrivingByHand
 from services.planning.behaviours.driving import Approaching, Carrying
 from services.planning.behaviours.following import Following
 from services.planning.behaviours.going import Going
+from services.planning.behaviours.going_there import GoingThere
 from services.planning.behaviours.handling import Closing, Lifting, PuttingDown, Reaching
 from services.planning.behaviours.looking import Exploring, Idling, Parking, Searching
 from services.planning.behaviours.touching import Touching
@@ -35,6 +36,7 @@ BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
     actions.Touch: Touching,
     actions.GoTo: Going,
     actions.Drive: DrivingByHand,
+    actions.GoThere: GoingThere,
     actions.BabbleArm: ArmBabbling,
     actions.BabbleWheels: WheelBabbling,
 }

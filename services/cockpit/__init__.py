@@ -1,0 +1,1 @@
+"""The cockpit: one page in a browser that shows the robot, stops it, and has it carry out tasks."""

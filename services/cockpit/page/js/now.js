@@ -1,0 +1,35 @@
+// What the robot does now and why, in one line each.
+import { make, mark, the, write } from "./dom.js";
+import { announce } from "./said.js";
+import { title } from "./tasks.js";
+import { called, metres, say, span } from "./words.js";
+
+let told = "";
+
+/** Show the task and the planner's reason of a message `state`. `mayCancel`: whether this person may end the task. */
+export function showNow(state, mayCancel) {
+  const { task, plan } = state;
+  const runs = Boolean(task?.task_id && !task.outcome);
+  the("cancel").hidden = !(runs && mayCancel);
+  write(the("now-task"), task?.task_id ? outcome(task) : say("now.idle"));
+  const phase = runs ? [called("phase", task.phase), task.distance_m != null ? metres(task.distance_m) : "", span(task.elapsed_s ?? 0)] : [];
+  steps(the("now-phases"), runs ? (task.phases ?? []).length : 0, phase.filter(Boolean).join(" · "));
+  write(the("now-why"), (runs ? plan?.why || task.text : task?.reason || plan?.why) || say("now.stands"));
+  mark(the("now-task"), "class", runs ? null : { done: "good", failed: "bad" }[task?.outcome]);
+  const news = task?.task_id ? `${title(task)}: ${runs ? called("phase", task.phase) : say(`outcome.${task.outcome}`)}` : "";
+  if (news && news !== told) announce(news);
+  told = news;
+}
+
+function outcome(task) {
+  return task.outcome ? `${title(task)} — ${say(`outcome.${task.outcome}`)}` : title(task);
+}
+
+/** One dot for each phase so far, then the present one in words. */
+function steps(box, count, text) {
+  const shown = Math.min(count, 9);
+  if (box.querySelectorAll("i").length !== shown || !box.lastChild || box.lastChild.nodeName === "I") {
+    box.replaceChildren(...Array.from({ length: shown }, () => make("i", { "aria-hidden": "true" })), make("span"));
+  }
+  write(box.querySelector("span"), text);
+}
