@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -42,6 +43,7 @@ from cocoro.objects import Catalogue
 from cocoro.participant import Answer
 from cocoro.robot import Robot
 from cocoro.topics import Request
+from services.cockpit.access_peer import Peers
 from services.executive.askers import asker_key
 from services.executive.tasks import FetchTask
 
@@ -203,7 +205,15 @@ def test_pages_of_others_are_not_and_are_told_why(server: FoxgloveServer, origin
     assert "may not reach the robot" in through_the_door(server, origin)
 
 
-def through_the_door(server: FoxgloveServer, origin: str | None) -> str:
+def test_with_tasks_only_programs_of_the_same_user_are_let_through(server: FoxgloveServer) -> None:
+    peers = Peers()
+    assert through_the_door(server, None, peers.user) == ""
+    for stranger in (os.getuid() + 1, None):
+        assert "its owner's programs" in through_the_door(server, None, lambda *_, user=stranger: user)
+    peers.close()
+
+
+def through_the_door(server: FoxgloveServer, origin: str | None, user_of: Any = None) -> str:
     """Why a viewer from there is refused; '' when he sees the robot."""
 
     def look(address: str) -> str:
@@ -214,7 +224,7 @@ def through_the_door(server: FoxgloveServer, origin: str | None) -> str:
             return str(refused)
 
     async def run() -> str:
-        async with Door("127.0.0.1", 0, (server.host, server.port)) as door:
+        async with Door("127.0.0.1", 0, (server.host, server.port), user_of) as door:
             return await asyncio.to_thread(look, address_of("127.0.0.1", door.port))
 
     return asyncio.run(run())

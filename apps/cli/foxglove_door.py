@@ -8,12 +8,15 @@ this machine that is drawn anew each time, one of 16 million.
 from __future__ import annotations
 
 import asyncio
+import os
 import secrets
+from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
 from urllib.parse import urlsplit
 
 from cocoro.errors import ConfigError
+from services.cockpit.access_peer import Address
 
 HEAD_BYTES, HEAD_S = 8192, 5.0
 """The longest head of a request, and the longest time that it may take."""
@@ -49,10 +52,20 @@ def why_not(head: bytes) -> str:
 class Door:
     """Listens for viewers and passes on what they and the server say. An asynchronous context manager."""
 
-    def __init__(self, host: str, port: int, inner: tuple[str, int]) -> None:
-        """`host`, `port`: where viewers come; port 0 is any free one. `inner`: where the server is."""
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        inner: tuple[str, int],
+        user_of: Callable[[Address, Address], int | None] | None = None,
+    ) -> None:
+        """`host`, `port`: where viewers come; port 0 is any free one. `inner`: where the server is. `user_of`: the user
+        whose process has the one end of a connection, of which the other end is here; then only processes of this
+        user, and of root, are let through.
+        """
         self._host, self.port = host, port
         self._inner = inner
+        self._user_of = user_of
         self._open: set[asyncio.Task[None]] = set()
         self._server: asyncio.Server | None = None
 
@@ -91,7 +104,7 @@ class Door:
     async def _let_through(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         async with asyncio.timeout(HEAD_S):
             head = await reader.readuntil(b"\r\n\r\n")
-        refused = why_not(head) or ("too many viewers" if len(self._open) > MOST else "")
+        refused = self._why_not_them(writer) or why_not(head) or ("too many viewers" if len(self._open) > MOST else "")
         if refused:
             text = f"{refused}\n".encode()
             writer.write(
@@ -114,6 +127,15 @@ class Door:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
             their_writer.close()
+
+    def _why_not_them(self, writer: asyncio.StreamWriter) -> str:
+        """Why a process is not let through, whatever it asks; '' when it is."""
+        if self._user_of is None:
+            return ""
+        there, here = writer.get_extra_info("peername")[:2], writer.get_extra_info("sockname")[:2]
+        if self._user_of(there, here) in (os.getuid(), 0):
+            return ""
+        return "this robot takes tasks from its owner's programs alone"
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -72,7 +72,7 @@ def view(
     ] = None,
     operate: Annotated[
         bool,
-        typer.Option("--operate", help="With --foxglove: take tasks, too, from every program on this machine."),
+        typer.Option("--operate", help="With --foxglove: take tasks, too, from this user's programs on this machine."),
     ] = False,
     robot: RobotOption = None,
     site: ThroughOption = None,

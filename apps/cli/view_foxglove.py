@@ -1,7 +1,7 @@
 """`cocoro view --foxglove`: a running robot in Foxglove, by a WebSocket server on this machine.
 
 Everybody who reaches the server sees the robot and can stop it. Only with `--operate` it takes tasks, too, and then
-only from this machine, for it does not know who asks: tasks are given in the name of who runs this command.
+only from programs of the same user on this machine: tasks are given in the name of who runs this command.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import CancelRequest, EstopRequest, TaskRequest
 from cocoro.topics import CANCEL, ESTOP, RUN, TOPICS
 from deploy.processes import stoppable
+from services.cockpit.access_peer import Peers
 from services.executive.askers import asker_key
 from services.executive.tasks import TASKS
 
@@ -90,13 +91,15 @@ async def serve(choice: RobotChoice, place: Place) -> int:
             link.robot, link.described(), link.catalogue(), topics,
             host=hidden_address(), port=0, services=asked.services(operate=place.operate),
         ) as server:  # fmt: skip
-            async with Door(place.bind, place.port, (server.host, server.port)) as door:
+            peers = Peers()
+            mine = peers.user if place.operate else None
+            async with Door(place.bind, place.port, (server.host, server.port), mine) as door:
                 address = address_of(place.bind, door.port)
                 print(f"{link.robot} is at {address}: open {page_of(address)}")
                 if place.layout is not None:
                     print(f"{place.layout}: import it there, under Layouts")
                 if place.operate:
-                    print("it takes tasks from every program on this machine")
+                    print("it takes tasks from every program of this user on this machine")
                 print("Ctrl-C ends it", flush=True)
                 await _show(link, server, asked)
     return exits.DONE
