@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import subprocess
@@ -13,13 +14,19 @@ from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from stop_rig import PATIENCE_S, full_queue, new_robot, stop
 
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import RealClock
+from cocoro.node import Node
+from cocoro.robot import Robot
 from cocoro.stop import asking as asking_module
 from cocoro.stop.asking import Asking, addresses
 from cocoro.stop.path import PREFIX, StopPoint, listen
+from services.cockpit.stopping import Stopper
 
 ROOT = Path(__file__).parents[1]
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can be another user")
@@ -90,6 +97,33 @@ def test_everything_that_moves_is_halted_before_it_answers_and_says_that_the_lat
             assert (point.kept, point.why_not_kept) == (True, "")
             assert halted[point.service] == [f"operator (user {os.getuid()}, pid {os.getpid()})"]
         assert not asking.waiting
+
+
+def test_who_asks_is_told_of_each_that_is_halted_as_it_answers(robot: str) -> None:
+    told: list[tuple[str, bool]] = []
+    with moving(robot, "base", "arm", "hand"):
+        with Asking(robot, heard=lambda point: told.append((point.service, point.latched_ns is not None))) as asking:
+            asking.go_on(time.monotonic() + PATIENCE_S)
+        assert sorted(told) == [("arm", True), ("base", True), ("hand", True)]
+
+
+def test_the_cockpits_stop_takes_the_path_and_needs_no_answer_of_the_mesh(robot: str) -> None:
+    news: list[dict[str, Any]] = []
+
+    async def stopped() -> dict[str, Any]:
+        bus = LocalMesh().join()  # on which nobody answers
+        async with Node("cockpit", bus, RealClock(), Robot.load(), robot_name=robot) as node:
+            stopper = Stopper(node, news.append)
+            for service in ("base", "arm", "hand"):
+                stopper.lives(service, True)
+            return await stopper.stop("ada")
+
+    with moving(robot, "base", "arm", "hand") as halted:
+        told = asyncio.run(stopped())
+        assert told["acknowledged"] == ["base", "arm", "hand"]
+        assert (told["missing"], told["trouble"], told["final"]) == ([], "", True)
+        assert [one["final"] for one in news] == [False, True]  # the first acknowledgement is told at once
+        assert all(by[0].startswith("cockpit: ada") for by in halted.values())
 
 
 def test_a_robot_is_stopped_by_its_name_and_another_is_not(robot: str) -> None:
