@@ -69,12 +69,12 @@ def test_where_something_stands_there_is_no_room_and_it_says_how_much_there_is()
 
 
 def test_a_place_within_a_ring_is_out_of_reach_and_it_stays_where_it_is() -> None:
-    ring = [(1.6 + 0.6 * cos(k * pi / 40), 0.6 * sin(k * pi / 40)) for k in range(80)]
+    ring = [(2.6 + 0.6 * cos(k * pi / 40), 0.6 * sin(k * pi / 40)) for k in range(80)]
     planner = standing_at(ring)
-    planner.want("go-there", place_m=(1.6, 0.0))
+    planner.want("go-there", place_m=(2.6, 0.0))
     status = until_over(planner)
     assert (status.state, status.reason) == ("failed", "unreachable")
-    assert "no way to (1.60, 0.00)" in status.why
+    assert "no way to (2.60, 0.00)" in status.why
     assert all(
         output.message.left_mps <= 0.0  # type: ignore[attr-defined]
         for step in planner.under_test.steps
