@@ -91,7 +91,9 @@ ASKED: list[tuple[Callable[[RobotClient], TaskHandle], dict[str, Any]]] = [
     (lambda robot: robot.follow("blue_ball", for_s=10.0), {"task": "follow", "label": "blue_ball", "for_s": 10.0}),
     (lambda robot: robot.touch("red_can"), {"task": "touch", "label": "red_can"}),
     (lambda robot: robot.go_to("mug", distance_m=0.3), {"task": "go-to", "label": "mug", "distance_m": 0.3}),
-    (lambda robot: robot.put_down(), {"task": "put-down"}),
+    (lambda robot: robot.go_there(1.0, -0.5), {"task": "go-there", "x_m": 1.0, "y_m": -0.5}),
+    (lambda robot: robot.put_down(), {"task": "put-down", "x_m": None, "y_m": None}),
+    (lambda robot: robot.put_down(x_m=1.0, y_m=0.5), {"task": "put-down", "x_m": 1.0, "y_m": 0.5}),
     (lambda robot: robot.park(), {"task": "park"}),
     (lambda robot: robot.run({"task": "nod", "times": 3}), {"task": "nod", "times": 3}),
 ]

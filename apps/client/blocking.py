@@ -191,8 +191,11 @@ class BlockingRobot:
     def go_to(self, label: str, *, distance_m: float = 0.2, **options: Any) -> TaskResult:
         return self._done(lambda: self._robot.go_to(label, distance_m=distance_m, **options))
 
-    def put_down(self, **options: Any) -> TaskResult:
-        return self._done(lambda: self._robot.put_down(**options))
+    def go_there(self, x_m: float, y_m: float, **options: Any) -> TaskResult:
+        return self._done(lambda: self._robot.go_there(x_m, y_m, **options))
+
+    def put_down(self, *, x_m: float | None = None, y_m: float | None = None, **options: Any) -> TaskResult:
+        return self._done(lambda: self._robot.put_down(x_m=x_m, y_m=y_m, **options))
 
     def park(self, **options: Any) -> TaskResult:
         return self._done(lambda: self._robot.park(**options))

@@ -25,7 +25,7 @@ from cocoro.robot import Robot
 from cocoro.task_errors import refusal
 from cocoro.tasks import Task
 from cocoro.topics import CANCEL, OBJECTS, REPORT, Topic
-from services.executive.tasks import FetchTask, FollowTask, GoToTask, ParkTask, PutDownTask, TouchTask
+from services.executive.tasks import FetchTask, FollowTask, GoThereTask, GoToTask, ParkTask, PutDownTask, TouchTask
 
 M = TypeVar("M", bound=Message)
 
@@ -95,9 +95,13 @@ class RobotClient:
         """Drive to an object and stop at a distance from its nearest edge, from the robot's centre, over the floor."""
         return self.run(GoToTask(label=label, distance_m=distance_m), **options)
 
-    def put_down(self, **options: Any) -> TaskHandle:
-        """Set down what the hand holds."""
-        return self.run(PutDownTask(), **options)
+    def go_there(self, x_m: float, y_m: float, **options: Any) -> TaskHandle:
+        """Drive to a place on the floor, odometry frame, around what stands in the way."""
+        return self.run(GoThereTask(x_m=x_m, y_m=y_m), **options)
+
+    def put_down(self, *, x_m: float | None = None, y_m: float | None = None, **options: Any) -> TaskHandle:
+        """Set down what the hand holds: here, or at a place on the floor, odometry frame, which needs both."""
+        return self.run(PutDownTask(x_m=x_m, y_m=y_m), **options)
 
     def park(self, **options: Any) -> TaskHandle:
         """Fold the arm."""
