@@ -1,8 +1,9 @@
 """What hostile clients of the cockpit cost a robot that drives: the period of its wheel commands, with and without.
 
-Each kind of flood (`bench/cockpit_flood.py`) takes turns with as long a time without it, while the robot follows a ball
-and a page of its operator is open. Besides: how long the page waits for an answer, and a STOP of the page while each
-kind floods. The clients have the lowest priority. As root, some of them are another user's.
+Each kind of flood (`bench/cockpit_flood.py`) takes turns with as long a time without it, while the operator turns the
+robot by hand from a page, 25 motions a second. Besides: for which share of the time it turned, how long the page waits
+for an answer, and a STOP of the page while each kind floods. The clients have the lowest priority. As root, some of
+them are another user's.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from websockets.asyncio.client import ClientConnection, connect
 
+from bench.cockpit_viewer import header_of
 from bench.live import NAME, Operator, operator
 from bench.report import Report, percentile
 from bench.trials import number_of, sized
@@ -47,6 +49,7 @@ KINDS: dict[str, tuple[tuple[str, bool], ...]] = {
 """The clients of each flood: kind, and whether they are another user's."""
 BOUND = 1.5
 ASKS_HZ = 20.0
+TURN_RADPS, HOLD_HZ = 0.5, 25.0
 PATIENCE_S = 60.0
 
 
@@ -58,11 +61,22 @@ def options(parser: argparse.ArgumentParser) -> None:
 def measure(chosen: argparse.Namespace, report: Report) -> None:
     count, seconds = sized(chosen, chosen.count, 5, 1), sized(chosen, chosen.seconds, 6.0, 3.0)
     with operator() as cocoro:
-        code, said, _ = cocoro("up", "sim", "--scene", "follow", "--detach", "--set", "service.cockpit.port=0")
+        code, said, _ = cocoro("up", "sim", "--detach", "--set", "service.cockpit.port=0")
         found = re.search(r"cockpit: http://127\.0\.0\.1:(\d+)/", said)
         if code or found is None:
             raise CocoroError(f"the robot with a cockpit did not start: {said}")
         asyncio.run(Bench(cocoro, int(found[1]), seconds, report).run(count))
+
+
+class Turn(NamedTuple):
+    """What was seen in one turn."""
+
+    period_ms: float
+    """99th percentile of the period of the commands for the wheels."""
+    wait_ms: float
+    """99th percentile of the page's waits for an answer."""
+    moved: float
+    """Percent of the states in which the robot turned."""
 
 
 class Bench:
@@ -75,8 +89,7 @@ class Bench:
             bus.listen(BASE_COMMAND.key(NAME), self._on_commands, 0.02)
             async with Page.opened(self._port) as page:
                 for name, clients in KINDS.items():
-                    with self._following():
-                        await page.sees_it_drive()
+                    async with page.turning():
                         await self._compare(name, clients, count, page)
                 for name, clients in KINDS.items():
                     await self._stop(name, clients, page)
@@ -84,18 +97,9 @@ class Bench:
     def _on_commands(self, samples: list[Received]) -> None:
         self._arrived += [sample.received_ns for sample in samples]
 
-    @contextmanager
-    def _following(self) -> Iterator[None]:
-        process = self._cocoro.start("follow", "blue_ball")
-        try:
-            yield
-        finally:
-            process.terminate()
-            process.communicate(timeout=PATIENCE_S)
-
     async def _compare(self, name: str, clients: tuple[tuple[str, bool], ...], count: int, page: Page) -> None:
-        calm: list[tuple[float, float]] = []
-        flooded: list[tuple[float, float]] = []
+        calm: list[Turn] = []
+        flooded: list[Turn] = []
         spent: list[float] = []
         for _ in range(count):
             calm.append(await self._turn(page))
@@ -106,19 +110,22 @@ class Bench:
             self._report.say(f"{name}: {told}")
         self._report.ratio(
             f"99th percentile of the commands' period, {name} / without",
-            [row[0] for row in flooded], [row[0] for row in calm], at_most=BOUND,
+            [turn.period_ms for turn in flooded], [turn.period_ms for turn in calm], at_most=BOUND,
         )  # fmt: skip
-        self._report.value(f"99th percentile of a page's wait for an answer, {name}", [row[1] for row in flooded], "ms")
+        waits = [turn.wait_ms for turn in flooded]
+        self._report.value(f"99th percentile of a page's wait for an answer, {name}", waits, "ms")
+        self._report.value(f"share of the time that it turned, {name}", [turn.moved for turn in flooded], "%")
         self._report.value(f"a core for the cockpit, {name}", spent, "%")
 
-    async def _turn(self, page: Page) -> tuple[float, float]:
-        """The 99th percentiles of the commands' period and of the page's waits in one turn, ms."""
+    async def _turn(self, page: Page) -> Turn:
         self._arrived.clear()
+        page.moved.clear()
         waits = await page.waits_ms(self._seconds)
         periods = [(after - before) / 1e6 for before, after in pairwise(self._arrived)]
-        if not periods:
-            raise CocoroError("no command came for the wheels")
-        return percentile(periods, 99), percentile(waits, 99)
+        if not periods or not page.moved:
+            raise CocoroError("no command came for the wheels, or no state for the page")
+        moved = 100.0 * sum(page.moved) / len(page.moved)
+        return Turn(percentile(periods, 99), percentile(waits, 99), moved)
 
     @contextmanager
     def _flooding(self, clients: tuple[tuple[str, bool], ...], seconds: float | None = None) -> Iterator[list[str]]:
@@ -158,13 +165,15 @@ class Bench:
 
 
 class Page:
-    """A page of the operator: asks what lies at a place of the floor, again and again."""
+    """A page of the operator with pictures: asks what lies at a place of the floor, again and again."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._numbers = itertools.count(1)
-        self._state: dict[str, Any] = {}
+        self._tick = 0
+        self.moved: list[bool] = []
+        """Whether the robot turned, in each state that came."""
         self._news = asyncio.Event()
 
     @classmethod
@@ -172,7 +181,6 @@ class Page:
     async def opened(cls, port: int) -> AsyncIterator[Page]:
         async with connect(f"ws://127.0.0.1:{port}/live", max_size=None) as socket:
             page = cls(socket)
-            await socket.send('{"do":"pictures","on":false}')
             hearing = asyncio.ensure_future(page._hear())
             try:
                 yield page
@@ -182,11 +190,14 @@ class Page:
     async def _hear(self) -> None:
         async for text in self._socket:
             if isinstance(text, bytes):
+                await self._socket.send(json.dumps({"do": "seen", "stamp_ns": header_of(text)["stamp_ns"]}))
                 continue
             message = json.loads(text)
             if message["kind"] == "state":
-                self._state = message
+                self.moved.append(abs((message.get("base") or {}).get("turn_radps") or 0.0) > TURN_RADPS / 4)
                 self._news.set()
+            elif message["kind"] == "tick":
+                self._tick = message["tick"]
             elif message["kind"] == "reply" and (waiting := self._answers.pop(message["id"], None)) is not None:
                 waiting.set_result(message)
 
@@ -204,9 +215,28 @@ class Page:
             await asyncio.sleep(max(0.0, begun_s + 1.0 / ASKS_HZ - time.monotonic()))
         return found
 
-    async def sees_it_drive(self) -> None:
-        """Waits until the robot drives."""
-        async with asyncio.timeout(PATIENCE_S):
-            while abs((self._state.get("base") or {}).get("speed_mps") or 0.0) < 0.02:
-                self._news.clear()
-                await self._news.wait()
+    @asynccontextmanager
+    async def turning(self) -> AsyncIterator[None]:
+        """Turns the robot by hand. Raises CocoroError when it does not turn."""
+        reply = await self.ask({"do": "begin-drive", "instead": True})
+        if not reply["ok"]:
+            raise CocoroError(f"the robot cannot be driven by hand: {reply['text']}")
+        holding = asyncio.ensure_future(self._hold())
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while not any(self.moved):
+                    self._news.clear()
+                    await self._news.wait()
+            yield
+        except TimeoutError:
+            raise CocoroError("the robot does not turn") from None
+        finally:
+            holding.cancel()
+            self.moved.clear()
+            await self.ask({"do": "end-drive"})
+
+    async def _hold(self) -> None:
+        while True:
+            order = {"do": "drive", "tick": self._tick, "motion": {"turn_radps": TURN_RADPS}}
+            await self._socket.send(json.dumps(order))
+            await asyncio.sleep(1.0 / HOLD_HZ)

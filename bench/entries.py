@@ -72,6 +72,7 @@ ENTRIES: dict[str, Entry] = {
     "lost-control": Entry("lost_control"),
     "mend": Entry("mend"),
     "network": Entry("network"),
+    "open": Entry("open_capture"),
     "planner": Entry("planner"),
     "pursuit": Entry("pursuit"),
     "readme": Entry("readme"),

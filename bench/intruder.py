@@ -18,6 +18,7 @@ end      key                 undeclares all
 from __future__ import annotations
 
 import json
+import os
 import random
 import subprocess
 import sys
@@ -58,12 +59,17 @@ class Intruder:
         endpoint: str,
         ca: Path | None = None,
         more: Mapping[str, Any] | None = None,
+        *,
+        yields: bool = False,
     ) -> None:
         """`ca`: the authority that it trusts, without or instead of that of its credentials; `more`: zenoh's options,
-        by path."""
+        by path. `yields`: it takes only the processor time that the robot leaves, as it is on another machine in truth.
+        """
         argv = [sys.executable, "-m", "bench.intruder", credentials or NOTHING, endpoint, ca or NOTHING]
         argv.append(json.dumps(more or {}))
         self._process = host.run(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        if yields:
+            os.sched_setscheduler(self._process.pid, os.SCHED_IDLE, os.sched_param(0))
         self._lock = threading.Lock()
         self.refused: str = self._read()
 
@@ -110,7 +116,11 @@ class Client:
 
     def flood(self, keys: list[str], bytes: int, count: int, hz: float = 0.0, payload: str = "") -> float:
         """Returns how many it sent in a second. It waits where its link does not take more."""
-        content = _bytes(payload) * (bytes // max(len(payload), 1)) if payload not in ("", RANDOM) else None
+        content = None
+        if payload not in ("", RANDOM):
+            content = zenoh.ZBytes(
+                _bytes(payload) * (bytes // max(len(payload), 1))
+            )  # held once, however many are sent
         begun_s = time.monotonic()
         for number in range(count):
             if hz and (ahead_s := begun_s + number / hz - time.monotonic()) > 0:

@@ -2,22 +2,25 @@
 
 Asks the robot for the task `drive`, turns round, and drives ahead at full speed. Appends to FILE the time
 (CLOCK_MONOTONIC, ns, 8 bytes) at which each request was sent whose motion was accepted. A line on standard input ends
-that: `freeze` stops asking as a frozen program does, `let-go` asks for rest.
+that: `freeze` stops asking as a frozen program does, `let-go` asks for rest. Standard error tells why the robot does
+what it does.
 """
 
 from __future__ import annotations
 
 import asyncio
+import os
 import struct
 import sys
 import time
 from pathlib import Path
 
-from apps.cli.choice import RobotChoice
 from apps.cli.link import MeshLink, joined
+from apps.client.choice import RobotChoice
 from cocoro.driving import Driving, begin
 from cocoro.errors import CocoroError
 from cocoro.messages import Motion
+from cocoro.topics import PLAN
 from services.executive.askers import asker_key
 
 SENT = struct.Struct("<q")
@@ -64,11 +67,18 @@ async def main(robot: str, file: Path) -> None:
     """Drive until a line says what else to do, and for ever then."""
     said = asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline)
     async with joined(RobotChoice(robot, None)) as link:
-        link.bus.declare_alive(asker_key(link.robot, "bench-driver"))
-        driving = NotedDriving(link, await _task(link, "bench-driver"), file)
+        asker = f"driver-{os.getpid()}"
+        link.bus.declare_alive(asker_key(link.robot, asker))
+        plan = link.latest(PLAN)
+        driving = NotedDriving(link, await _task(link, asker), file)
         async with driving:
             begun_s = time.monotonic()
+            told = ""
             while not said.done():
+                why = driving.trouble or driving.reply.text or (plan.value.why if plan.value is not None else "")
+                if (word := why.partition(",")[0]) != told:
+                    told = word
+                    print(why, file=sys.stderr, flush=True)
                 driving.motion = TURN if time.monotonic() - begun_s < TURN_S else FAST
                 await asyncio.sleep(0.04)
             if (await said).strip() == "freeze":

@@ -35,6 +35,7 @@ NOT_RUN = {
     "cocoro servos scan": "needs the robot's hardware",
     "cocoro kinect calibrate": "needs a Kinect",
     "cocoro view": "opens a window or a browser",
+    "cocoro drive": "reads single keys from a terminal; tests/test_cli_drive.py has it",
     "cocoro site": "needs the folder of a site; tests/test_cli_site.py has it",
     "cocoro pki": "needs the folder of a site; tests/test_cli_pki.py has it",
     "cocoro up --site": "needs several machines; tests/test_site_hosts.py has it",

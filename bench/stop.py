@@ -19,7 +19,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -32,6 +32,8 @@ from cocoro import topics
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
 """Bound for the slowest stop, s, by situation; 1.0 for those that are not named."""
+BY_ITSELF = ("shm-full", "shm-16M", "disk-full")
+"""Situations that begin before the robot starts, or do not end before it does."""
 COUNTS = {"quiet": 50, "loaded": 50}
 TRUE = "had an effect, and said so"
 """What each stop must be."""
@@ -214,25 +216,41 @@ def options(parser: argparse.ArgumentParser) -> None:
         "situations", nargs="*", type=one_of(SITUATIONS), metavar="SITUATION", help=f"{', '.join(SITUATIONS)}; or all"
     )
     parser.add_argument("--count", type=number_of, help="stops in each; 50 where it is quiet or loaded, else 20")
+    parser.add_argument("--one-robot", action="store_true", help="the same robot for all situations that allow it")
     parser.add_argument("--any-time", action="store_true", help="judge the effect and the report, not the time")
 
 
 def measure(chosen: argparse.Namespace, report: Report) -> None:
     in_namespaces()
-    for situation in chosen.situations or (["quiet"] if chosen.short else SITUATIONS):
-        report.say(f"{situation}: {SITUATIONS[situation]}")
-        count = sized(chosen, chosen.count, COUNTS.get(situation, 20), 2)
-        _measure(report, situation, count, any_time=chosen.any_time)
+    situations = chosen.situations or (["quiet"] if chosen.short else [*SITUATIONS])
+    for group in groups(situations) if chosen.one_robot else [[situation] for situation in situations]:
+        for situation in group:
+            report.say(f"{situation}: {SITUATIONS[situation]}")
+        counts = {one: sized(chosen, chosen.count, COUNTS.get(one, 20), 2) for one in group}
+        _measure(report, counts, any_time=chosen.any_time)
 
 
-def _measure(report: Report, situation: str, count: int, *, any_time: bool) -> None:
-    bound_s = BOUNDS_S.get(situation, 1.0)
+def groups(situations: Iterable[str]) -> list[list[str]]:
+    """The situations that one robot can meet one after the other, and each of the others by itself."""
+    together = [situation for situation in situations if situation not in BY_ITSELF]
+    return [*([together] if together else []), *([one] for one in situations if one in BY_ITSELF)]
+
+
+def _measure(report: Report, counts: Mapping[str, int], *, any_time: bool) -> None:
+    """One robot in one situation after the other, each with its number of stops."""
     with ExitStack() as stack:
-        if situation.startswith("shm"):
-            stack.enter_context(small_shm("16M" if situation == "shm-16M" else "64M"))
+        for situation in counts:
+            if situation.startswith("shm"):
+                stack.enter_context(small_shm("16M" if situation == "shm-16M" else "64M"))
         here = stack.enter_context(place())
         here.up()
-        stops = asyncio.run(stops_in(here, situation, count, report.notes.append))
+        stops = {one: asyncio.run(stops_in(here, one, count, report.notes.append)) for one, count in counts.items()}
+    for situation, of_situation in stops.items():
+        _report(report, situation, of_situation, any_time=any_time)
+
+
+def _report(report: Report, situation: str, stops: Sequence[Stopped], *, any_time: bool) -> None:
+    bound_s = BOUNDS_S.get(situation, 1.0)
     runs = Runs(report)
     for one in stops:
         fault = one.fault(PATIENCE_S if any_time else bound_s)
@@ -243,4 +261,4 @@ def _measure(report: Report, situation: str, count: int, *, any_time: bool) -> N
     report.value(f"{situation}: at the latest", [max(zero_s)], "s", at_most=None if any_time else bound_s)
     report.value(f"{situation}: standing at the latest after", [max(one.stood_s for one in stops)], "s")
     report.value(f"{situation}: the command took", [one.ended_s for one in stops], "s")
-    report.share(f"{situation}: ended with exit code 0", sum(one.code == 0 for one in stops), count)
+    report.share(f"{situation}: ended with exit code 0", sum(one.code == 0 for one in stops), len(stops))

@@ -10,6 +10,10 @@ their modules, such as `cocoro.component`. Names that are not listed here are in
 - Messages: `Topic` and `Request` declare what travels; `Message` is the base of every published message, `Qos` the
   quality of service of a key, `Bus` the interface to the mesh. `Latest` and `Stream` read a topic's `Inbox`, and a
   `Publisher` publishes on one topic.
+- A client: `connect` and `connect_blocking` operate a robot from a program, `rehearse` tries the program on a
+  simulated one in virtual time, `open` reads a capture as arrays (docs/client.md). They are lent to this package by the
+  applications, and `from cocoro import *` leaves them out. A task that a robot refuses is a `TaskRefusedError` of its
+  own kind, one that is not done a `TaskEndedError`; `Motion` drives by hand.
 - A task: `Task` and `Skills`, `Action` for the planner, `TaskFailedError` to end it as failed.
 - Time: `Clock` and its kinds, `is_fresh` for ages, `every` for loops, `NS` nanoseconds per second; `run_virtual` runs a
   coroutine in virtual time.
@@ -26,30 +30,39 @@ Parts with a module of their own: `cocoro.topics` (the project's topics and requ
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from cocoro.api import *
-
 __all__ = [
-    "NS", "Action", "Answer", "Bus", "CallTimeoutError", "Catalogue", "Clock", "CocoroError", "Component",
-    "ConfigError", "Contact", "Core", "FollowedClock", "History", "Implementation", "Inbox", "Latest", "MeshError",
-    "Message", "Node", "ObjectSpec", "Output", "Participant", "Pose2", "Publisher", "Qos", "RealClock",
-    "RefusedError", "RemoteError", "Request", "Robot", "Sample", "Schedule", "ServiceLatch", "Skills", "Stream",
-    "Take", "Task", "TaskFailedError", "Topic", "VirtualClock", "every", "is_fresh", "run_virtual",
+    "NS", "Action", "Answer", "AskerGoneError", "BadRequestError", "BatteryLowError", "Bus", "BusyError",
+    "CallTimeoutError", "Catalogue", "Clock", "CocoroError", "Component", "ConfigError", "Contact", "Core",
+    "FollowedClock", "History", "HoldingError", "Implementation", "Inbox", "Latest", "MeshError", "Message", "Motion",
+    "NoTaskError", "Node", "NotAliveError", "NotGraspableError", "NotHoldingError", "ObjectSpec", "Output",
+    "Participant", "Pose2", "Publisher", "Qos", "RealClock", "RefusedError", "RemoteError", "Request", "Robot",
+    "Sample", "Schedule", "ServiceLatch", "Skills", "StoppedError", "Stream", "Take", "Task", "TaskCancelledError",
+    "TaskEndedError", "TaskFailedError", "TaskLostError", "TaskRefusedError", "Topic", "UnknownLabelError",
+    "VirtualClock", "every", "is_fresh", "run_virtual",
 ]  # fmt: skip
 
+_LENT = {
+    "connect": "apps.client.connecting",
+    "connect_blocking": "apps.client.blocking",
+    "open": "apps.client.opening",
+    "rehearse": "apps.client.rehearsing",
+}
+"""Names of applications that a user finds here, by module. They are imported by name when they are used first: nothing
+of this package imports what stands above it. Type checkers see all names in `__init__.pyi`."""
 
-if not TYPE_CHECKING:  # type checkers see the import above, and report unknown names
 
-    def __getattr__(name: str) -> object:
-        if name not in __all__:  # the name of a module, or an unknown one
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from cocoro import api
+def __getattr__(name: str) -> object:
+    if name in _LENT:
+        from importlib import import_module
 
-        globals().update({public: getattr(api, public) for public in __all__})
-        return globals()[name]
+        return getattr(import_module(_LENT[name]), name)
+    if name not in __all__:  # the name of a module, or an unknown one
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from cocoro import api
+
+    globals().update({public: getattr(api, public) for public in __all__})
+    return globals()[name]
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_LENT})

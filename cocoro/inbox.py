@@ -66,6 +66,11 @@ class Inbox(Generic[M]):
     def remove(self, reader: Callable[[str, M], None]) -> None:
         self._readers = tuple(each for each in self._readers if each != reader)
 
+    @property
+    def is_read(self) -> bool:
+        """Whether it has any reader."""
+        return bool(self._readers)
+
     def deliver(self, key: str, payload: Payload) -> None:
         """The bus's callback. A payload that cannot be accepted is counted and dropped."""
         if len(payload) > self._max_bytes:
@@ -198,6 +203,10 @@ class Latest(Generic[M]):
         message = self.value
         assert message is not None
         return message
+
+    def close(self) -> None:
+        """Takes no more messages."""
+        self._inbox.remove(self._take)
 
 
 class Stream(Generic[M]):

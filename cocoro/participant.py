@@ -5,6 +5,7 @@ A service is a `cocoro.node.Node`, which also publishes and serves. The command 
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -22,6 +23,10 @@ from cocoro.topics import Request, Topic
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
+
+
+_APART = 1.5
+"""Periods of a request's limit between two of the same."""
 
 
 class Answer(NamedTuple, Generic[R]):
@@ -42,6 +47,8 @@ class Participant:
     """Frames that may wait for the event loop, per key."""
     depth: ClassVar[int] = 256
     """Other messages that may wait for the event loop, per key."""
+    paced: bool = False
+    """Whether the same request is asked no sooner than a site lets it pass (`Request.most_hz`)."""
 
     def __init__(self, bus: Bus, clock: Clock, robot_name: str) -> None:
         self.bus = bus
@@ -49,6 +56,8 @@ class Participant:
         self.robot_name = robot_name
         self._inboxes: dict[str, Inbox[Any]] = {}
         self._handles: list[Handle] = []
+        self._may_ask_s: dict[str, float] = {}
+        """When each request may be asked next, on the event loop's clock, by name."""
 
     def keep(self, handle: Handle) -> None:
         """Closes the handle together with this participant."""
@@ -128,10 +137,20 @@ class Participant:
 
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
         wait_s = request.timeout_s if timeout_s is None else timeout_s
+        if self.paced:
+            await self._pause(request)
         replies = await self.bus.call(
             request.key(self.robot_name), msgspec.msgpack.encode(question), wait_s, request.qos
         )
         return [_decoded(request, reply) for reply in replies]
+
+    async def _pause(self, request: Request[Any, Any]) -> None:
+        """Wait until the request may be asked again. The network may bring two questions nearer to each other than they
+        were, by up to a third of the period."""
+        loop = asyncio.get_running_loop()
+        at_s = max(loop.time(), self._may_ask_s.get(request.name, 0.0))
+        self._may_ask_s[request.name] = at_s + _APART / request.most_hz
+        await asyncio.sleep(at_s - loop.time())
 
     def unserved(self, request: Request[Any, Any]) -> str:
         """The error's text when no service serves a request."""

@@ -105,6 +105,8 @@ class Request(Generic[Q, R]):
     """Questions and answers are published for recorders, unless this is False."""
     qos: Qos = Qos.COMMAND
     """Of question and answer."""
+    most_hz: float = 40.0
+    """How often a person's link to a site may ask it; what follows the last one sooner gets no answer."""
 
     @property
     def server(self) -> str:
@@ -260,7 +262,7 @@ CANCEL = Request(
 DRIVE = Request(
     "executive/drive", m.DriveRequest, m.DriveReply,
     "One input of an operator who drives by hand; it moves the robot for at most 0.2 s.",
-    timeout_s=0.5,
+    timeout_s=0.5, most_hz=100.0,
 )  # fmt: skip
 REPORT = Request(
     "executive/report", m.ReportRequest, m.TaskState,
@@ -280,7 +282,7 @@ TASKS = Request(
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch the emergency stop; answered by each service that moves something, and by the executive.",
-    timeout_s=1.0, right="stop",
+    timeout_s=1.0, right="stop", most_hz=200.0,
 )  # fmt: skip
 RESET = Request(
     "{service}/reset", m.ResetRequest, m.EstopReply,
@@ -315,7 +317,7 @@ ABOUT = Request(
 TIME = Request(
     "{service}/time", m.TimeRequest, m.TimeReply,
     "The robot's time on a host, from its gateway; hosts and persons compare their clocks by it.",
-    timeout_s=1.0, right="see", recorded=False,
+    timeout_s=1.0, right="see", recorded=False, most_hz=1000.0,
 )  # fmt: skip
 
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)

@@ -54,6 +54,8 @@ ARGUMENTS: dict[str, str] = {
     "pki renew": "base --site {name}",
     "pki revoke": "base --site {name}",
     "pki list": "--site {name}",
+    "cockpit invite": "viewer --name {name}",
+    "cockpit end": "{name}",
     "servos set-id": "1 2 --port {name}",
     "servos calibrate": "elbow",
     "servos limits": "elbow",

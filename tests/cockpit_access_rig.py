@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 from services.cockpit import server
 from services.cockpit.access import App, Certificates, Gate, GateLimits, Message, Receive, Send, Visitor
-from services.cockpit.access_door import Connection, Door, DoorLimits
-from services.cockpit.access_limits import Audit
+from services.cockpit.access_connection import Connection
+from services.cockpit.access_door import Door
+from services.cockpit.access_limits import Audit, DoorLimits
 from services.cockpit.access_people import People
 from services.cockpit.access_rules import LOOPBACK_NAMES, Scope
 from services.cockpit.access_tls import Entrance

@@ -252,14 +252,13 @@ async def live(
     name: str = "calliope",
     scene: Path | str = "paper",
     mesh: str = "",
-    also: Sequence[str] = (),
+    processes: Sequence[str] = PROCESSES,
     **sim: Any,
 ) -> AsyncIterator[LiveRobot]:
-    """Start a robot and shut it down at the end. `also`: processes besides `PROCESSES`; `sim`: settings of the
-    simulator besides `SLOW`."""
+    """Start a robot and shut it down at the end. `sim`: settings of the simulator besides `SLOW`."""
     root = short_folder()
     robot = LiveRobot(name, root, folder)
-    robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh, (*PROCESSES, *also)))
+    robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh, processes))
     try:
         await robot.start()
         yield robot

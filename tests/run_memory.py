@@ -3,9 +3,11 @@
 They are those whose environment names the folder (`COCORO_TESTS_RECORD`). Memory that several processes share is
 counted in parts (proportional set size, proc_pid_smaps(5)), so that the sum has each page once. `memory.json` in the
 folder gets the largest processes of the look with the largest sum, of every look the sum and its parts by the file of
-tests for which a process runs, and for every test the most that it needed: what its worker does not share with other
-workers, and the processes that it started. A worker writes which test it runs (`running-PID`, `tests/run_record.py`),
-and what a test starts inherits the variable `PYTEST_CURRENT_TEST`. What begins and ends between two looks is not seen.
+tests for which a process runs, and for every test the most that was there while it ran: what its worker does not share
+with other workers, and all processes that tests of this worker have started, also earlier ones of its file, whose
+fixtures go on. A worker writes which test it runs (`running-PID`, `tests/run_record.py`), and what a test starts
+inherits the variables `PYTEST_CURRENT_TEST` and `COCORO_TESTS_WORKER`, the number of the worker. What begins and ends
+between two looks is not seen.
 """
 
 from __future__ import annotations
@@ -34,8 +36,11 @@ KEPT = 0.9
 """Share of what a test needed in the run before that counts at least: a look may miss the moment that needs most."""
 RUNNING = "running-"
 """Before the number of a worker: the file that has the test that it runs."""
+WORKER = "COCORO_TESTS_WORKER"
+"""Environment variable of what tests start: the number of the worker that runs them."""
 _FIELD = re.compile(rb"^(Pss|Private_Clean|Private_Dirty):\s+(\d+) kB", re.MULTILINE)
 _TEST = re.compile(rb"(?:^|\0)PYTEST_CURRENT_TEST=([^\0]+) \(\w+\)")
+_WORKER = re.compile(rb"(?:^|\0)" + WORKER.encode() + rb"=(\d+)")
 
 
 class Memory(NamedTuple):
@@ -47,12 +52,24 @@ class Memory(NamedTuple):
     """What it does not share."""
 
 
+class Origin(NamedTuple):
+    """Where a process comes from."""
+
+    test: str
+    """The test that started it, or nothing: then it runs tests itself."""
+    worker: str
+    """The number of the worker of that test."""
+
+
 class Seen(NamedTuple):
     """A process at one look."""
 
     title: str
     memory: Memory
     test: str
+    """For which it runs: that which started it, or the one that it runs."""
+    need_of: str
+    """The test that runs now and needs it."""
     worker: bool
     """It runs tests itself, and shares with the other workers what none of them needs more for."""
 
@@ -63,8 +80,8 @@ class Watch:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._mark = f"COCORO_TESTS_RECORD={folder}".encode()
-        self._ours: dict[tuple[str, str], str] = {}
-        """By number and time of birth: the test that started it, or nothing."""
+        self._ours: dict[tuple[str, str], Origin] = {}
+        """By number and time of birth."""
         self.peak_mb, self.at_s = 0.0, 0.0
         self.looks: list[tuple[float, float, dict[str, float]]] = []
         """Time in s, sum in MB, and its parts by the file of tests."""
@@ -78,7 +95,7 @@ class Watch:
 
     def look(self) -> None:
         """Sum the memory of all that run now."""
-        now: dict[tuple[str, str], str] = {}
+        now: dict[tuple[str, str], Origin] = {}
         found: list[Seen] = []
         for name in os.listdir("/proc"):  # noqa: PTH208 # many times a minute
             if not name.isdigit() or int(name) == os.getpid():
@@ -86,22 +103,23 @@ class Watch:
             with suppress(OSError, IndexError):
                 process = Path("/proc") / name
                 born = process.joinpath("stat").read_text(errors="replace").rpartition(")")[2].split()[19]
-                test = self._ours.get((name, born), "")
-                if not test:
+                origin = self._ours.get((name, born))
+                if origin is None or not origin.test:
                     environment = process.joinpath("environ").read_bytes()
-                    if self._mark not in environment and (name, born) not in self._ours:
+                    if self._mark not in environment and origin is None:
                         continue
-                    started = _TEST.search(environment)
-                    test = started[1].decode() if started else ""
-                now[name, born] = test
-                found.append(Seen(_title(process), memory_mb(process), test or self._runs(name), worker=not test))
+                    origin = _origin(environment)
+                now[name, born] = origin
+                runs = self._runs(origin.worker if origin.test else name)
+                test = origin.test or runs
+                found.append(Seen(_title(process), memory_mb(process), test, runs or test, worker=not origin.test))
         self._ours = now
         total_mb, at_s = sum(seen.memory.part for seen in found), time.monotonic() - self._begun_s
         parts: dict[str, float] = defaultdict(float)
         own_mb: dict[str, float] = defaultdict(float)
         for seen in found:
             parts[seen.test.partition("::")[0] or seen.title] += round(seen.memory.part, 1)
-            own_mb[seen.test] += seen.memory.own if seen.worker else seen.memory.part
+            own_mb[seen.need_of] += seen.memory.own if seen.worker else seen.memory.part
         for test, size_mb in own_mb.items():
             self.own_mb[test] = max(self.own_mb[test], round(size_mb, 1))
         self.looks.append((round(at_s, 1), round(total_mb, 1), parts))
@@ -127,6 +145,11 @@ def memory_mb(process: Path) -> Memory:
     except PermissionError:  # a process of another user: what is shared is counted whole
         whole_mb = int(process.joinpath("statm").read_text().split()[1]) * resource.getpagesize() / 1e6
         return Memory(whole_mb, whole_mb)
+
+
+def _origin(environment: bytes) -> Origin:
+    test, worker = _TEST.search(environment), _WORKER.search(environment)
+    return Origin(test[1].decode() if test else "", worker[1].decode() if worker else "")
 
 
 def _title(process: Path) -> str:

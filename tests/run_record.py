@@ -17,7 +17,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from run_memory import LAST, RUNNING
+from run_memory import LAST, RUNNING, WORKER
 
 FOLDER = "COCORO_TESTS_RECORD"
 """Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
@@ -61,6 +61,7 @@ class Record:
         self._begun_s = time.monotonic()
         self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+        os.environ[WORKER] = str(os.getpid())
 
     @property
     def last(self) -> Path:
@@ -70,6 +71,7 @@ class Record:
     def begin(self) -> None:
         """What was before is not counted: this process was forked."""
         self._before_s = processor_s()
+        os.environ[WORKER] = str(os.getpid())
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:

@@ -20,12 +20,15 @@ from run_memory import LEAST_MB, MEMORY
 BUDGET_MB = 820.0
 """For what the tests that run at a time need. Pytest and its workers share 130 MB more."""
 LARGE_MB = 400.0
-"""The tests of a file that need more are a job of their own, so that the rest fits beside more."""
+"""The tests of a file that need more are a job of their own, so that the rest fits beside more. Not so where they share
+a fixture of their file: what it has started runs during all of them, and each job would start it again."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
-TWO_ROBOTS = ("test_faults_two_robots.py", "test_site_clocks.py", "test_site_hosts.py", "test_site_intruders.py")
-"""Files with two robots, or with one over several hosts."""
-TWO_ROBOTS_MB = 740.0
+TWO_ROBOTS_MB = {
+    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 640.0, "test_site_clocks.py": 400.0,
+    "test_site_intruders.py": 820.0,
+}  # fmt: skip
+"""Files with two robots, or with one over several hosts, and what their tests with `zenoh` may need."""
 URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
 
@@ -44,9 +47,11 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
         known = json.loads(file.read_text()).get("own_mb")
     found: dict[tuple[Path, bool], list[pytest.Item]] = defaultdict(list)
     needs_mb: dict[tuple[Path, bool], float] = defaultdict(float)
+    items = list(items)
+    whole = {item.path for item in items if _shares(item)}
     for item in items:
         need_mb = _need_mb(item, known)
-        part = item.path, need_mb > LARGE_MB
+        part = item.path, need_mb > LARGE_MB and item.path not in whole
         found[part].append(item)
         needs_mb[part] = max(needs_mb[part], need_mb)
     return [Job(of_part, needs_mb[part]) for part, of_part in found.items()]
@@ -55,13 +60,19 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
 def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
     if known is not None and item.nodeid in known:
         return max(known[item.nodeid], LEAST_MB)
-    if item.path.name in TWO_ROBOTS and item.get_closest_marker("zenoh"):
-        return TWO_ROBOTS_MB
+    if item.path.name in TWO_ROBOTS_MB and item.get_closest_marker("zenoh"):
+        return TWO_ROBOTS_MB[item.path.name]
     marks = {mark.name for mark in item.iter_markers()}
     guesses = (
         GUESSED_MB if known is None else GUESSED_MB[:1]
     )  # what the looks have missed took a moment, as no robot does
     return next((mb for needed, mb in guesses if needed <= marks), LEAST_MB)
+
+
+def _shares(item: pytest.Item) -> bool:
+    """Whether a fixture of the test is made once for its file."""
+    fixtures = item._fixtureinfo.name2fixturedefs  # type: ignore[attr-defined]
+    return any(of_name[-1].scope == "module" for of_name in fixtures.values())
 
 
 @dataclass

@@ -44,6 +44,22 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         cocoro.Nothing  # type: ignore[attr-defined] # noqa: B018
 
 
+def test_type_checkers_see_the_names_that_applications_lend_as_they_are_found() -> None:
+    stub = ast.parse(Path(cocoro.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    seen = {
+        alias.name: node.module
+        for node in ast.walk(stub)
+        if isinstance(node, ast.ImportFrom) and node.module != "cocoro.api"
+        for alias in node.names
+    }
+    assert seen == cocoro._LENT  # type: ignore[attr-defined] # what the stub does not have
+    for name, module in seen.items():
+        assert callable(getattr(cocoro, name))
+        assert getattr(cocoro, name).__module__ == module
+        assert name in dir(cocoro)
+        assert name not in cocoro.__all__
+
+
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("statement", "loaded"), [("import cocoro", []), ("from cocoro import errors", ["cocoro.errors"])]

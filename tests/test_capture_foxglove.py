@@ -71,7 +71,8 @@ def test_without_foxglove_one_line_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    monkeypatch.delitem(sys.modules, "apps.captures.export.foxglove", raising=False)
+    for module in ("apps.captures.export.foxglove", "apps.captures.export.foxglove_scene"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
     assert main(["export", str(GOLDEN), "--foxglove", str(tmp_path / "fox.mcap")]) == 1
     assert "pip install 'cocoro-mesh[foxglove]'" in capsys.readouterr().err
     assert not (tmp_path / "fox.mcap").exists()

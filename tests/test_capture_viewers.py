@@ -16,7 +16,7 @@ from capture_rig import ROBOT, Room, drive
 from apps.captures.export import rerun_scene
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, address_of, free_port, sent
 from apps.cli.main import main
-from apps.cli.view import WAITING, Waiting, watch
+from apps.cli.viewed import WAITING, Waiting, watch
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.capture.conventions import CaptureError

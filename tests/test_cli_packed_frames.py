@@ -7,7 +7,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from apps.cli.packed_frames import unpacking
+from apps.client.packed_frames import unpacking
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import VirtualClock

@@ -25,6 +25,7 @@ COMMANDS = {" ".join(words): command for words, command, _ in commands()}
 TELLS_NOTHING = {
     "estop": "it reads its own --json, without typer",
     "stop": "it reads its own --json, without typer",
+    "drive": "it is steered from the keyboard, and shows on the terminal what the robot does",
     "run": "its output is the log of a process",
     "view": "it opens a window",
     "replay": "it publishes until its end, steered from the keyboard",

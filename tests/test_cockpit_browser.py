@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 from browser_rig import DRIVING, browser, opened
-from faults_live import LiveRobot, live
+from faults_live import PROCESSES, LiveRobot, live
 from operator_shell import PATIENCE_S
 from playwright.sync_api import Browser, Error, Page, expect
 
@@ -72,7 +72,9 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
     folder = tmp_path_factory.mktemp("cockpit")
     (folder / "far.toml").write_text(SCENE)
     # STOP reaches all robots of a name on this machine: this one has its own.
-    life = live(folder, name="seen", scene=folder / "far.toml", also=("capture", "cockpit"), mesh=ANY_PORT)
+    life = live(
+        folder, name="seen", scene=folder / "far.toml", mesh=ANY_PORT, processes=(*PROCESSES, "capture", "cockpit")
+    )
     (folder / "state").mkdir(mode=0o700)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COCORO_STATE_DIR", str(folder / "state"))

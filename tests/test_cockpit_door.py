@@ -17,8 +17,7 @@ from cockpit_access_rig import Open, served
 from websockets.asyncio.client import connect
 
 from services.cockpit.access import GateLimits
-from services.cockpit.access_door import DoorLimits
-from services.cockpit.access_limits import Rate
+from services.cockpit.access_limits import DoorLimits, Rate
 from services.cockpit.access_peer import Peers
 
 LIMIT_S = 60.0

@@ -154,7 +154,9 @@ def test_the_names_of_the_certificate_are_those_of_the_cockpit(lab: Lab) -> None
     found = entrance(lab.config(names=["robot.local", "fd00::1"]))
     assert found.beyond
     assert {"localhost", "127.0.0.1", "robot.local", "fd00::1"} <= found.names
-    assert found.url(1) == "https://127.0.0.1:1/"
+    assert found.url(1) == "https://robot.local:1/"
+    assert entrance(lab.config(names=["fd00::1"])).url(1) == "https://[fd00::1]:1/"
+    assert entrance(lab.config()).url(1) == "https://127.0.0.1:1/"
 
 
 # --- certificates of persons --------------------------------------------------------------------------
@@ -200,6 +202,12 @@ async def test_persons_of_the_site_are_let_in_by_their_roles(lab: Lab) -> None:
             assert (await get(cockpit, context))[9:12] == looks, name
             assert (await get(cockpit, context, "/run", "POST", origin))[9:12] == operates, name
         assert cockpit.audit.has("a viewer who wants to operate")
+
+
+@in_real_time
+async def test_this_machines_user_needs_no_certificate_and_no_code(lab: Lab) -> None:
+    async with served(**remote(lab)) as cockpit:
+        assert (await get(cockpit, lab.client(None), "/run", "POST"))[9:12] == b"200"
 
 
 @pytest.mark.usefixtures("from_elsewhere")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 
 import pytest
 
@@ -29,21 +30,21 @@ def telling(number: int) -> bool:
 NUMBERS = [number for number in range(len(HAPPENINGS)) if telling(number)]
 
 
-@pytest.fixture(scope="module")
-def trials() -> dict[int, Trial]:
-    return {number: run_trial(SEED, number) for number in NUMBERS}
+@cache
+def trial_of(number: int) -> Trial:
+    return run_trial(SEED, number)
 
 
 @pytest.mark.parametrize("number", NUMBERS, ids=lambda number: happening_of(number)[0].name)
-def test_whatever_happens_at_full_speed_the_robot_stands_in_time(trials: dict[int, Trial], number: int) -> None:
-    trial = trials[number]
+def test_whatever_happens_at_full_speed_the_robot_stands_in_time(number: int) -> None:
+    trial = trial_of(number)
     assert trial.speed_mps >= 0.97 * full_speed_mps(trial.drive)
     assert trial.stand_s <= STAND_S, trial
     assert trial.stand_s > 0.1, "it was driving, and has a ramp"
 
 
 @pytest.mark.process
-def test_a_trial_is_the_same_again_in_another_process(trials: dict[int, Trial]) -> None:
+def test_a_trial_is_the_same_again_in_another_process() -> None:
     number = NUMBERS[1]  # a short one
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        assert pool.submit(run_trial, SEED, number).result() == trials[number]
+        assert pool.submit(run_trial, SEED, number).result() == trial_of(number)

@@ -257,6 +257,10 @@ def test_while_states_are_late_the_goals_of_all_joints_wait_so_that_the_hand_sta
         to = HandPose(0.37, 0.0, 0.2, CONFIG.arm.pitch_rad)
         steps = [controller.reach(to, 0.25, PARKED, TICK_S) for _ in range(round(seconds / TICK_S))]
         assert not any(step.blocked for step in steps)
+        gaps = np.abs(steps[-1].goal_rad - late)
+        assert steps[-1].speed_radps[gaps > 0.01] / gaps[gaps > 0.01] == pytest.approx(
+            steps[-1].speed_radps.max() / gaps.max()
+        ), "all joints arrive at once"
         return np.array([step.goal_rad for step in steps])
 
     waiting = goals(CONFIG.arm.wait_s)

@@ -132,3 +132,19 @@ async def test_the_robot_drives_round_the_can_to_the_place_behind_it() -> None:
         ways = [plan for plan in plans if plan.way_m]
         assert all(plan.goal_m == (2.2, 0.0) for plan in ways)
         assert max(abs(y) for plan in ways for _, y in plan.way_m) > 0.15, "the way leads round the can"
+
+
+@pytest.mark.sim
+@in_virtual_time
+async def test_a_fetched_can_is_put_down_at_the_place_without_a_detour_round_itself() -> None:
+    async with RobotRig() as rig:
+        await rig.holding()
+        begun_s = rig.now_s
+        reply = await rig.operator.call(topics.RUN, asked("put-down", x_m=2.2, y_m=0.5))
+        assert reply.accepted, reply.text
+        state = await rig.outcome(reply.task_id)
+        assert state.outcome == "done", state.reason
+        x, y, z = rig.thing("red_can").position_m
+        assert hypot(x - 2.2, y - 0.5) < 0.06
+        assert z == pytest.approx(0.06, abs=0.01), "it stands on the floor"
+        assert rig.now_s - begun_s < 15.0

@@ -10,7 +10,8 @@ import pytest
 from robot_rig import RobotRig
 from spelled import asked
 
-from apps.rehearsal.rehearse import TaskRefusedError, rehearse
+import cocoro
+from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.core import Core
@@ -93,9 +94,9 @@ def test_what_is_not_there_is_not_found_and_the_robot_stands(tmp_path: Path) -> 
 
 
 def test_what_cannot_be_asked_is_refused() -> None:
-    with pytest.raises(TaskRefusedError, match=r"unknown object 'teapot'; known are .*red_can"):
+    with pytest.raises(cocoro.TaskRefusedError, match=r"unknown object 'teapot'; known are .*red_can"):
         rehearse(small(label="teapot"))
-    with pytest.raises(TaskRefusedError, match="the hand holds nothing"):
+    with pytest.raises(cocoro.TaskRefusedError, match="the hand holds nothing"):
         rehearse(small(task="put-down", label=""))
     with pytest.raises(ConfigError, match=r"--latency planing: no such service; known are .*planning"):
         rehearse(small(latency={"planing": 0.1}))

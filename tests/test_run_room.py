@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from run_memory import LEAST_MB, MEMORY, Watch
-from run_room import LARGE_MB, TWO_ROBOTS, Room, jobs_of
+import pytest
+from run_memory import LEAST_MB, MEMORY, RUNNING, WORKER, Watch
+from run_record import FOLDER
+from run_room import LARGE_MB, TWO_ROBOTS_MB, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
 
-def item(name: str, *markers: str) -> Any:
-    """What a test has that matters here; its name begins with its file."""
+def item(name: str, *markers: str, fixtures: dict[str, str] | None = None) -> Any:
+    """What a test has that matters here; its name begins with its file. `fixtures`: the scope of each."""
+    definitions = {name: (SimpleNamespace(scope=scope),) for name, scope in (fixtures or {}).items()}
     marks = [SimpleNamespace(name=marker) for marker in markers]
     closest = {marker: marker for marker in markers}.get
     path = Path(name.partition("::")[0])
-    return SimpleNamespace(nodeid=name, path=path, iter_markers=lambda: marks, get_closest_marker=closest)
+    return SimpleNamespace(
+        nodeid=name, path=path, iter_markers=lambda: marks, get_closest_marker=closest,
+        _fixtureinfo=SimpleNamespace(name2fixturedefs=definitions),
+    )  # fmt: skip
 
 
 def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
@@ -32,7 +41,7 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS[0]))
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", next(iter(TWO_ROBOTS_MB))))
     for folder in (None, tmp_path):
         jobs = jobs_of([*items, robot, robots], folder)
         assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
@@ -42,7 +51,7 @@ def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp
 
 
 def test_the_file_with_two_robots_is_there() -> None:
-    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS)
+    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS_MB)
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
@@ -66,6 +75,39 @@ def test_the_large_tests_of_a_file_are_a_job_of_their_own(tmp_path: Path) -> Non
     assert [([one.nodeid for one in job.items], job.need_mb) for job in jobs] == [
         (["a::a", "a::c"], 300.0), (["a::b", "a::d"], LARGE_MB + 50),
     ]  # fmt: skip
+
+
+def test_a_file_whose_tests_share_a_fixture_is_one_job(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::first": LARGE_MB + 50, "b::large": LARGE_MB + 10}}))
+    shared = {"robot": "session", "lab": "module"}
+    whole = [item("a::first", fixtures=shared), item("a::apart"), item("a::later", fixtures=shared)]
+    parts = [item("b::large", fixtures={"robot": "session"}), item("b::quick")]
+    jobs = jobs_of([*whole, *parts], tmp_path)
+    assert [(job.items, job.need_mb) for job in jobs] == [
+        (whole, LARGE_MB + 50), (parts[:1], LARGE_MB + 10), (parts[1:], LEAST_MB),
+    ]  # fmt: skip
+
+
+@pytest.mark.process
+def test_what_a_fixture_has_started_is_needed_by_every_test_during_which_it_runs(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    folder.mkdir()
+    worker = str(os.getpid())
+    (folder / f"{RUNNING}{worker}").write_text("a::later")
+    marks = {FOLDER: str(folder), "PYTEST_CURRENT_TEST": "a::first (setup)", WORKER: worker}
+    filled = "held = bytearray(60_000_000); print(flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", filled], env=os.environ | marks, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as started:
+        assert started.stdout is not None
+        started.stdout.readline()
+        watch = Watch(folder)
+        watch.look()
+        started.kill()
+    assert watch.own_mb["a::later"] > 60.0
+    assert "a::first" not in watch.own_mb
+    ((_, _, parts),) = watch.looks
+    assert parts["a"] > 60.0
 
 
 def test_a_second_robot_waits_and_what_is_small_begins_meanwhile() -> None:

@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    with lab(tmp_path_factory.mktemp("site"), width=160, height=120, frame_rate_hz=10.0) as made:
+    with lab(tmp_path_factory.mktemp("site"), processes=("sim",), width=160, height=120, frame_rate_hz=10.0) as made:
         made.network.links().set(delay_ms=1.0)
         made.up()
         yield made

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -86,7 +86,8 @@ class Scene(NamedTuple):
 def scene() -> Iterator[Scene]:
     if why := obstacle():
         pytest.skip(why)
-    with in_short_folder() as folder, lab(folder, sensors="ideal") as site, ExitStack() as stack:
+    small: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 5.0, "sensors": "ideal"}
+    with in_short_folder() as folder, lab(folder, processes=("sim",), **small) as site, ExitStack() as stack:
         site.up()
         site.deliver(site.desk, (BRAIN,))  # stolen
         body, brain = (

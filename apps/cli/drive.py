@@ -15,8 +15,8 @@ from apps.cli.keyboard import DOWN, LEFT, QUIT, RIGHT, UP, keyboard
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import InsteadOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import complain, going_on
-from apps.cli.tasks import ASK_AGAIN_S, UNSETTLED_S
 from apps.cli.terminal import StatusLine
+from apps.client.task_run import ASK_AGAIN_S, UNSETTLED_S
 from cocoro.driving import Driving, begin
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.messages import CancelRequest, Motion, ReportRequest, TaskReply, TaskState

@@ -34,7 +34,7 @@ _SUMMARIES = {
         "record": "Record what travels on the mesh into MCAP files, until Ctrl-C.",
         "replay": "Send a capture into the mesh again.",
         "export": "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments.",
-        "view": "Open Rerun on a capture, or live on the mesh.",
+        "view": "Open Rerun on a capture, or live on the mesh; or serve the robot to Foxglove.",
     },
     TOOLS: {
         "top": "Services and topics, live: cpu, memory, rates against nominal, ages; what was skipped, lost, rejected.",

@@ -91,7 +91,7 @@ def _status(as_json: bool) -> int:
         return code
     import asyncio
 
-    from apps.cli.choice import RobotChoice
+    from apps.client.choice import RobotChoice
 
     _report_failures()
     return asyncio.run(show_status(RobotChoice(), as_json))

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import completions
-from apps.cli.choice import RobotChoice as RobotChoice
+from apps.client.choice import RobotChoice as RobotChoice
 from cocoro.errors import ConfigError, choice_of
 
 

@@ -12,13 +12,11 @@ import typer
 
 from apps.cli import estop as stopping
 from apps.cli import exits
-from apps.cli.link import Answer, joined
+from apps.cli.link import joined
 from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import complain, print_json
-from cocoro.errors import MeshError
-from cocoro.messages import EstopReply, ResetRequest
-from cocoro.topics import RESET
-from deploy.processes import stoppable
+from apps.client import stopping as stopping_by_mesh
+from apps.client.stopping import NotReleasedError
 
 app = typer.Typer()
 CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -47,35 +45,17 @@ async def release(choice: RobotChoice, as_json: bool = False) -> int:
 
     The executive is asked first: when it refuses, everything stays latched.
     """
-    question = ResetRequest(by="operator")
     async with joined(choice) as link:
-        alive = await link.alive()
-        moving = {service for service in stoppable() if service in alive}
-        if not moving:
-            raise MeshError(f"no service that moves something is alive on {link.robot}: see `cocoro status`")
-        if "executive" in alive and _refused({"executive"}, await link.call_all(RESET.of("executive"), question)):
-            return exits.REFUSED
-        answers = await link.call_all(RESET.of("*"), question)
-        if _refused(moving, answers):
+        try:
+            released = await stopping_by_mesh.release(link, "operator")
+        except NotReleasedError as error:
+            for reason in error.reasons:
+                complain(reason)
             return exits.REFUSED
     if as_json:
-        print_json({"robot": link.robot, "released": sorted(moving)})
+        print_json({"robot": link.robot, "released": list(released.services)})
     else:
-        print(f"{link.robot}: released {', '.join(sorted(moving))}")
-    for answer in answers:
-        if answer.reply is not None and answer.reply.text:
-            complain(f"{answer.service}: {answer.reply.text}")
+        print(f"{link.robot}: released {', '.join(released.services)}")
+    for note in released.notes:
+        complain(note)
     return exits.DONE
-
-
-def _refused(wanted: set[str], answers: list[Answer[EstopReply]]) -> bool:
-    """Whether any of the `wanted` services did not release its latch; prints which and why."""
-    by_service = {answer.service: answer for answer in answers}
-    refused = False
-    for service in sorted(wanted):
-        answer = by_service.get(service, Answer(service, None, "no answer"))
-        if answer.reply is None or answer.reply.latch != "released":
-            why = answer.error or (answer.reply.text if answer.reply else "") or "it is still latched"
-            complain(f"{service} does not release the emergency stop: {why}")
-            refused = True
-    return refused

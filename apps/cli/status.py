@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from apps.cli.choice import RobotChoice
+    from apps.client.choice import RobotChoice
     from deploy.rundir import RunDir
 
 REPLAYED = "replayed"

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from threading import Condition
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
@@ -22,22 +19,16 @@ from apps.cli.export import progress_bar
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice, RobotOption, ThroughOption, capture_file
-from cocoro.bus.base import Bus, Payload
+from apps.cli.viewed import Waiting, watch
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError
-from cocoro.messages import AboutRequest, Message
-from cocoro.topics import ABOUT, FRAME, TOPICS, Topic
+from cocoro.messages import AboutRequest
+from cocoro.topics import ABOUT
 
 if TYPE_CHECKING:
-    from apps.captures.export.rerun_scene import RerunScene
     from sim.outside import OutsideStage
 
-PER_SERVICE = "{service}"
-DEPTH = 4
-"""Messages of one key that may wait; a viewer that is late shows the newest."""
-WAITING, WAITING_FRAMES = 500, 2
-"""Messages, and frames among them, that may wait for the viewer."""
 FLUSH_S = 10.0
 LOOK_S = 0.2
 """How often it is seen that the viewer was closed."""
@@ -58,7 +49,10 @@ def view(
     ] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve it as a page for a browser; needs no display.")] = False,
     bind: Annotated[
-        str, typer.Option("--bind", metavar="ADDRESS", help="With --web: serve it here; 0.0.0.0 is every address.")
+        str,
+        typer.Option(
+            "--bind", metavar="ADDRESS", help="With --web or --foxglove: serve it here; 0.0.0.0 is every address."
+        ),
     ] = "127.0.0.1",
     save: Annotated[
         Path | None, typer.Option("--save", metavar="OUT.rrd", help="Write it to a file for Rerun; needs no display.")
@@ -66,10 +60,38 @@ def view(
     connect: Annotated[
         str | None, typer.Option("--connect", metavar="HOST[:PORT]", help="Send it to a viewer that runs there.")
     ] = None,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve the running robot to Foxglove; needs cocoro-mesh[foxglove].")
+    ] = False,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="With --foxglove: serve it here, by default 8765.")
+    ] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option("--layout", metavar="OUT.json", help="With --foxglove: write the layout that Foxglove imports."),
+    ] = None,
+    operate: Annotated[
+        bool,
+        typer.Option("--operate", help="With --foxglove: take tasks, too, from this user's programs on this machine."),
+    ] = False,
     robot: RobotOption = None,
     site: ThroughOption = None,
 ) -> None:
-    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
+    """Open Rerun on a capture, or live on the mesh; or serve the robot to Foxglove. Needs the extra `view` or
+    `foxglove`."""
+    if foxglove:
+        others = {"a FILE": file, "--sim": sim, "--web": web, "--save": save, "--connect": connect}
+        if given := [name for name, value in others.items() if value]:
+            raise ConfigError(
+                f"--foxglove shows the running robot: leave out {', '.join(given)}; "
+                "for a capture there is `cocoro export FILE --foxglove OUT.mcap`"
+            )
+        from apps.cli import view_foxglove
+
+        place = view_foxglove.Place(bind, view_foxglove.DEFAULT_PORT if port is None else port, operate, layout)
+        sys.exit(asyncio.run(view_foxglove.serve(RobotChoice(robot, site), place)))
+    if port is not None or layout is not None or operate:
+        raise ConfigError("--port, --layout and --operate are for --foxglove; give that, too")
     target = Target(save=save, web=web, bind=bind, connect=connect)
     if file is not None:
         sys.exit(view_file(file, target, sim))
@@ -198,54 +220,3 @@ async def _stated_stage(link: MeshLink) -> OutsideStage:
         if answer.reply is not None and answer.reply.module in SIMULATORS:
             return stated_stage(answer.reply)
     raise ConfigError(f"--sim: {link.robot} has no simulator that runs; leave --sim out to see what the robot reports")
-
-
-class Waiting:
-    """Messages on their way to the viewer, which a thread of its own logs: the mesh never waits for a viewer."""
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._messages: deque[tuple[str, Message]] = deque()
-        self._changed = Condition()
-        self._open = True
-
-    def put(self, topic: str, message: Message) -> None:
-        """Queue a message to be logged. When too many wait it is dropped, a frame earlier than others."""
-        with self._changed:
-            frames = sum(name == FRAME.name for name, _ in self._messages) if topic == FRAME.name else 0
-            if len(self._messages) >= WAITING or frames >= WAITING_FRAMES:
-                self.dropped += 1
-                return
-            self._messages.append((topic, message))
-            self._changed.notify()
-
-    def close(self) -> None:
-        """Take no more messages. Those that wait are still logged."""
-        with self._changed:
-            self._open = False
-            self._changed.notify()
-
-    def log_to(self, scene: RerunScene) -> None:
-        """Log the queued messages until `close`. Raises ConfigError when the truth is of another scene than the one
-        stated."""
-        while True:
-            with self._changed:
-                while self._open and not self._messages:
-                    self._changed.wait()
-                if not self._messages:
-                    return
-                topic, message = self._messages.popleft()
-            scene.log(topic, message)
-
-
-def watch(bus: Bus, robot: str, waiting: Waiting) -> None:
-    """Keeps every message that arrives from now on for the viewer, however old it is: a viewer controls nothing."""
-
-    def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
-        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            waiting.put(topic.name, decoder.decode(bytes(payload)))  # a copy: the bus takes its memory back
-
-    for topic in TOPICS:
-        if PER_SERVICE not in topic.name:
-            handler = partial(receive, topic, msgspec.msgpack.Decoder(topic.type))
-            bus.subscribe(topic.key(robot), topic.qos, handler, depth=DEPTH)

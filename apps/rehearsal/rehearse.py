@@ -30,6 +30,7 @@ from cocoro.messages import BaseCommand, Detections, Frame, Recording, TaskReply
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
+from cocoro.task_errors import refusal
 from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
@@ -66,14 +67,6 @@ def rehearse(request: RehearsalRequest, tell: Tell = ignored) -> dict[str, Any]:
     result = run_virtual(_Rehearsal(request, tell).run())
     result["wall_s"] = round(time.perf_counter() - started, 3)
     return result
-
-
-class TaskRefusedError(CocoroError):
-    """The executive would not start the task."""
-
-    def __init__(self, reply: TaskReply) -> None:
-        super().__init__(reply.text)
-        self.code = reply.refusal
 
 
 class _Rehearsal:
@@ -214,7 +207,7 @@ class _Rehearsal:
                 await operator.sleep(0.1)
                 reply = await self._ask(operator, question)
             if not reply.accepted:
-                raise TaskRefusedError(reply)
+                raise refusal(reply)
             self._commanded = True
             state = await self._watch(states, reply.task_id)
             self._keep_step(state)

@@ -33,6 +33,8 @@ class MessageBlock(NamedTuple):
     """None: unknown until it is read."""
     loose: bool = False
     """It is a run outside of chunks."""
+    indices: Mapping[int, int] | None = None
+    """Where in the file the index of a channel's messages in this chunk is, by channel; None where none is stated."""
 
 
 @dataclass

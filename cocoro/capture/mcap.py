@@ -7,7 +7,7 @@ chunk's head. Each of these has its figure below, by `python -m bench capture-fo
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -120,6 +120,28 @@ def records(content: Bytes) -> Iterator[tuple[int, memoryview, int]]:
             raise DamageError(f"a record at byte {at} is longer than its chunk")
         yield op, view[start : start + length], at
         at = start + length
+
+
+def payloads(content: Bytes, wanted: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
+    """Channel, log time and payload of each message of these channels in a run of records. Raises DamageError.
+
+    Two thirds of the time of `records` with `message` for small messages.
+    """
+    view = memoryview(content)
+    end, at = len(view), 0
+    last, unpack = end - MESSAGE_HEAD.size, MESSAGE_HEAD.unpack_from
+    while at <= last:
+        op, length, channel, _, log_ns, _ = unpack(view, at)
+        start, at = at, at + PREFIX.size + length
+        if at > end:
+            raise DamageError(f"a record at byte {start} is longer than its chunk")
+        if op == Opcode.MESSAGE and channel in wanted:
+            if length < MESSAGE_FIELDS.size:
+                raise DamageError("a message is shorter than its head")
+            yield channel, log_ns, view[start + MESSAGE_HEAD.size : at]
+    for op, _, _ in records(view[at:]):
+        if op == Opcode.MESSAGE:
+            raise DamageError("a message is shorter than its head")
 
 
 def channel_of(content: memoryview) -> int:

@@ -9,14 +9,38 @@ from io import BytesIO
 import lz4.frame
 import zstandard
 from mcap.exceptions import EndOfFile
-from mcap.records import Attachment, AttachmentIndex, Footer
+from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer
 
 from cocoro.capture.mcap import PREFIX, Bytes, DamageError, ExactStream, crc32, footer_crc, parsed
 
+_CHUNK_INDEX, _INDEX_OFFSET = struct.Struct("<QQQQI"), struct.Struct("<HQ")
+_AFTER_OFFSETS, _SIZES = struct.Struct("<QI"), struct.Struct("<QQ")
 KNOWN = ("", "zstd", "lz4")
 """A chunk's compression, as its head names it."""
 LARGEST_CHUNK = 4 << 30
 """Bytes, compressed or not; the limit of the `mcap` package. A chunk that claims more is damaged."""
+
+
+def chunk_index(content: Bytes) -> ChunkIndex:
+    """Raises DamageError for content that cannot be the index of a chunk. A quarter of the package's time: a capture of
+    an hour has 36,000 of them."""
+    try:
+        start_ns, end_ns, at, length, size = _CHUNK_INDEX.unpack_from(content)
+        middle = _CHUNK_INDEX.size + size
+        if size % _INDEX_OFFSET.size or middle > len(content):
+            raise DamageError("the index of a chunk has a wrong length")
+        indices = dict(_INDEX_OFFSET.iter_unpack(content[_CHUNK_INDEX.size : middle]))
+        index_bytes, name_bytes = _AFTER_OFFSETS.unpack_from(content, middle)
+        name_at = middle + _AFTER_OFFSETS.size
+        name = str(content[name_at : name_at + name_bytes], "utf-8")
+        packed_bytes, raw_bytes = _SIZES.unpack_from(content, name_at + name_bytes)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise DamageError("the index of a chunk is damaged") from error
+    return ChunkIndex(
+        chunk_length=length, chunk_start_offset=at, compression=name, compressed_size=packed_bytes,
+        message_end_time=end_ns, message_index_length=index_bytes, message_index_offsets=indices,
+        message_start_time=start_ns, uncompressed_size=raw_bytes,
+    )  # fmt: skip
 
 
 def attachment_index(content: Bytes, offset: int, length: int) -> tuple[AttachmentIndex, int]:

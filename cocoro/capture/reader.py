@@ -16,9 +16,10 @@ import heapq
 import json
 import os
 import stat
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from contextlib import contextmanager
 from errno import ENOENT
 from functools import cached_property
 from pathlib import Path
@@ -29,17 +30,15 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistics
 
-from cocoro.capture import mcap, mcap_reading
-from cocoro.capture.contents import Contents, Disk, MessageBlock, miscounted, read_block
+from cocoro.capture import bulk, mcap, mcap_reading
+from cocoro.capture.ahead import Raw, read_ahead
+from cocoro.capture.contents import Contents, Disk, MessageBlock, miscounted
 from cocoro.capture.conventions import CHECKSUM, LEFT_OUT, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.scan import contents, front_to_back
 from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 from cocoro.keys import matches
 
-Raw = bytes | memoryview
-AHEAD = 4
-"""Chunks that a thread reads and unpacks ahead."""
 MOST_PROBLEMS = 20
 """Further problems are counted, not listed."""
 
@@ -266,7 +265,7 @@ class Capture:
         ]
         waiting: list[tuple[int, int, int, Record]] = []
         counts: Counter[int] = Counter()
-        for place, raw in self._read_ahead(places):
+        for place, raw in read_ahead(self._disk, places, self._contents.strict):
             while waiting and waiting[0][0] < place.start_ns:
                 yield heapq.heappop(waiting)[3]
             for order, message in enumerate(self._messages_in(place, raw, wanted)):
@@ -307,23 +306,8 @@ class Capture:
         channel_id, sequence, log_ns, publish_ns, payload = message
         return Record(self.channels[channel_id].topic, log_ns, publish_ns, sequence, payload, channel_id)
 
-    def _read_ahead(self, places: list[MessageBlock]) -> Iterator[tuple[MessageBlock, Future[Raw]]]:
-        """Read and unpack the next blocks in a thread while the caller works on the current one."""
-        pool = ThreadPoolExecutor(1, "capture reader")
-        ahead: deque[tuple[MessageBlock, Future[Raw]]] = deque()
-        try:
-            for place in places:
-                ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.strict)))
-                if len(ahead) > AHEAD:
-                    yield ahead.popleft()
-            while ahead:
-                yield ahead.popleft()
-        finally:
-            # Without waiting: a reader that was left in the middle may be collected in the pool's own thread.
-            pool.shutdown(wait=False, cancel_futures=True)
-
     def _messages_in(self, place: MessageBlock, raw: Future[Raw], wanted: set[int]) -> Iterator[mcap.McapMessage]:
-        try:
+        with self._skipping(place):
             for op, content, _ in mcap.records(raw.result()):
                 if op != Opcode.MESSAGE:
                     continue
@@ -332,6 +316,21 @@ class Capture:
                     yield mcap.message(content)
                 elif channel_id not in self.channels:
                     self.add_problem(f"a message belongs to channel {channel_id}, which the file does not declare")
+
+    def payloads(self, channels: Collection[int], *, by_index: bool = True) -> Iterator[bulk.Payload]:
+        """Channel, log time and payload of each message of these channels; each channel's in the order of the file:
+        `messages` for who takes them all at once. `by_index` looks only where a chunk's indices say that they are.
+        Raises CaptureError when the disk fails."""
+        for place in self._contents.places:
+            if place.channels is None or not place.channels.isdisjoint(channels):
+                with self._skipping(place):
+                    yield from bulk.payloads(self._disk, place, channels, self._contents.strict, by_index)
+
+    @contextmanager
+    def _skipping(self, place: MessageBlock) -> Iterator[None]:
+        """Notes a damaged block, whose rest is skipped."""
+        try:
+            yield
         except DamageError as damage:
             kind = "run of messages" if place.loose else "chunk"
             self.add_problem(f"the {kind} at byte {place.offset} ({place.length} bytes) is skipped: {damage}")

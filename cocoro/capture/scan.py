@@ -66,7 +66,7 @@ def _by_summary(disk: Disk) -> Contents:
         elif op == Opcode.STATISTICS:
             found.statistics, _ = mcap.parsed(Statistics, content)
         elif op == Opcode.CHUNK_INDEX:
-            indices.append(mcap.parsed(ChunkIndex, content)[0])
+            indices.append(mcap_reading.chunk_index(content))
         elif op == Opcode.METADATA_INDEX:
             index, _ = mcap.parsed(MetadataIndex, content)
             found.metadata_index[index.offset] = index.name
@@ -144,8 +144,9 @@ def _between_chunks(disk: Disk, found: Contents, indices: list[ChunkIndex], end:
 def _place(index: ChunkIndex) -> MessageBlock:
     channels = frozenset(index.message_index_offsets) or None
     return MessageBlock(
-        index.chunk_start_offset, index.chunk_length, index.message_start_time, index.message_end_time, channels
-    )
+        index.chunk_start_offset, index.chunk_length, index.message_start_time, index.message_end_time, channels,
+        indices=index.message_index_offsets or None,
+    )  # fmt: skip
 
 
 # --- from front to back ---------------------------------------------------------------------------

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 from cocoro.installed import all_requests, all_topics
 from cocoro.keys import alive_key, matches, recorder_key
 from cocoro.node import QUESTION_BYTES
-from cocoro.topics import Request
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
-from deploy.site.rules import ASKED_HZ, most_hz
+from deploy.site.rules import most_hz
 from services.executive.askers import asker_key
 
 TOPIC, REQUEST, TOKEN, OWN = "topic", "request", "token", "author's"
@@ -53,7 +52,7 @@ def matrix(site: Site, robot: str) -> list[Row]:
         for row in _each(topic, services)
     ]
     rows += [
-        Row(row.name, REQUEST, _may(may, row.key(robot), REQUEST), QUESTION_BYTES, _asked(request))
+        Row(row.name, REQUEST, _may(may, row.key(robot), REQUEST), QUESTION_BYTES, request.most_hz)
         for request in all_requests()
         for row in _each(request, services)
     ]
@@ -88,8 +87,3 @@ def _may(may: dict[str, Rights], key: str, kind: str) -> dict[str, tuple[str, ..
             verbs.remove("hears")
         found[name] = tuple(verbs)
     return found
-
-
-def _asked(request: Request[Any, Any]) -> float | None:
-    """Of a person's link; stops are not limited."""
-    return None if request.right == "stop" else ASKED_HZ

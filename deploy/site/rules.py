@@ -28,11 +28,6 @@ from deploy.site.rights import Rights, rights
 HEADROOM = 10.0
 """A key may be published this many times as often as its nominal rate: a network that stalls delivers what waited all
 at once, and only a flood comes more often than that for long."""
-ASKED_HZ = 1000.0
-"""A link may ask one service one request at most this often, where persons link; what comes sooner after the last is
-dropped, without an answer. Stops are never dropped. A link between hosts carries what several persons ask, and one of
-them must not have the others' requests dropped: it is limited where each comes in. A hub limits none, since zenoh
-counts all keys of a rule as one, and who asks fifty robots at once asks each of them once."""
 UNTABLED_HZ = 1000.0
 """A topic without a nominal rate may be published at most this often. Events are not limited, since each of them
 counts, nor are an author's own keys: one limit would hold for all of them together."""
@@ -206,7 +201,12 @@ def most_hz(topic: Topic[Any]) -> float | None:
 def _rates(site: Site, host: str) -> list[dict[str, Any]]:
     """Limits of rates: a message that follows the last one of its key on the same link too soon is dropped where it
     arrives. A request with a wildcard counts as one of those that it reaches: a rule with a wildcard would count the
-    requests to several services as one."""
+    requests to several services as one. A flood of stops is thinned as all requests are: the first one passes, and
+    then one in each period.
+
+    Requests (`Request.most_hz`) are limited where persons link. A link between hosts carries what several persons ask,
+    and one of them must not have the others' requests dropped. A hub limits none, since zenoh counts all keys of a rule
+    as one, and who asks fifty robots at once asks each of them once."""
     hub = site.is_hub(host)
     robot = ANY if hub else site.host(host).robot
     services = [service for component in components() for service in component.services]
@@ -220,9 +220,9 @@ def _rates(site: Site, host: str) -> list[dict[str, Any]]:
         each = [topic.of(service) for service in services] if topic.per_service else [topic]
         puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if freq is not None]
     if site.host(host).listen and not hub:
-        for request in (row for row in all_requests() if row.right != "stop"):
+        for request in all_requests():
             alike = [request.of(service) for service in services] if request.per_service else [request]
-            asked += [{"key_expr": row.key(robot), "freq": ASKED_HZ} for row in alike]
+            asked += [{"key_expr": row.key(robot), "freq": row.most_hz} for row in alike]
     return [
         {"id": f"rate {kind}", "link_protocols": ["tls"], "flows": [IN], "messages": [kind], "rules": rules}
         for kind, rules in (("put", puts), ("query", asked))

@@ -13,13 +13,13 @@ import pwd
 import time
 from collections.abc import Awaitable, Callable, Collection, MutableMapping
 from contextlib import suppress
-from http import cookies
 from typing import Any, NamedTuple
 
 from cocoro.errors import CocoroError, RefusedError
 from services.cockpit import access_rules as rules
-from services.cockpit.access_door import Connection, Door, DoorLimits
-from services.cockpit.access_limits import Audit, Budgets, Clock, Rate
+from services.cockpit.access_connection import Connection
+from services.cockpit.access_door import Door
+from services.cockpit.access_limits import Audit, Budgets, Clock, DoorLimits, Rate
 from services.cockpit.access_login import CODE_FIELD, login_page, style
 from services.cockpit.access_people import SESSION_S, People
 from services.cockpit.access_rules import Doing as Doing
@@ -30,6 +30,8 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
+LOGIN_BYTES = 1024
+"""Of the form with a code."""
 COOKIE = "__Host-cockpit"
 """A browser sends a cookie of this prefix to this host alone, over TLS alone."""
 
@@ -58,6 +60,8 @@ class GateLimits(NamedTuple):
     sockets: int = 8
     """Of one visitor."""
     sockets_all: int = 32
+    openings: Rate = Rate(2.0, 20.0)
+    """New sockets of one visitor: each costs the service more than a request does."""
     messages: Rate = Rate(100.0, 200.0)
     """Of one socket. The page sends 25 a second while somebody drives, and 15 for pictures."""
     message_bytes: int = 64 * 1024
@@ -105,6 +109,7 @@ class Gate:
         self.stops = Budgets(self.limits.stops, clock)
         self._logins = Budgets(self.limits.logins, clock)
         self._logins_all = Budgets(self.limits.logins_all, clock)
+        self.openings = Budgets(self.limits.openings, clock)
         self.sockets: dict[str, int] = {}
         """Open sockets, by the visitor's key."""
 
@@ -151,11 +156,10 @@ class Gate:
         if not self.tls:
             return None
         for header in rules.headers_of(scope).get("cookie", ()):
-            jar: cookies.SimpleCookie = cookies.SimpleCookie()
-            with suppress(cookies.CookieError):
-                jar.load(header)
-            if COOKIE in jar:
-                return jar[COOKIE].value
+            for part in header.split(";"):
+                name, _, value = part.strip().partition("=")
+                if name == COOKIE:
+                    return value
         return None
 
     def address(self, scope: Scope) -> str:
@@ -201,7 +205,7 @@ class Gate:
         if path == "/login" and method in ("GET", "HEAD"):
             return _html(200, login_page())
         if path == "/login" and method == "POST":
-            return self._log_in(scope, await whole_body(receive, self.limits.body_bytes))
+            return self._log_in(scope, await whole_body(receive, LOGIN_BYTES))
         if path == "/logout" and method == "POST":
             token = self.token(scope)
             if token is not None and self._people is not None and self._people.log_out(token):

@@ -15,45 +15,17 @@ import socket
 import ssl
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple, cast
 
-from services.cockpit.access_limits import Audit, Bucket, Budgets, Rate
+from services.cockpit.access_connection import Connection
+from services.cockpit.access_limits import Audit, Budgets, DoorLimits
 from services.cockpit.access_peer import Address, Peers, is_loopback, plain
 
 Protocols = Callable[[], asyncio.Protocol]
 
 
-class DoorLimits(NamedTuple):
-    """What connections may cost."""
-
-    connections: int = 96
-    """Open at once."""
-    each: int = 32
-    """Of one address; on loopback, of one user."""
-    takes: Rate = Rate(40.0, 80.0)
-    """New connections of one address or user."""
-    takes_all: Rate = Rate(100.0, 200.0)
-    refusals: Rate = Rate(1000.0, 500.0)
-    """Beyond that the door is closed for SHUT_S, and the kernel lets others wait."""
-    handshakes: int = 8
-    """TLS handshakes at once."""
-    bytes: Rate = Rate(24 * 1024.0, 128 * 1024.0)
-    """Received in one connection, which is read no faster. The page sends 8 KiB/s while somebody drives."""
-    first_s: float = 10.0
-    """Until the first request is whole."""
-    idle_s: float = 20.0
-    """Between two requests."""
-    stalled_s: float = 15.0
-    """For so long a client may take nothing of what waits for it."""
-    overfed_s: float = 10.0
-    """For so long a client may send more than `bytes` without a break."""
-
-
 AT_ONCE = 8
 """Connections that are looked at before the loop does something else."""
 SHUT_S = 0.05
-PIECE = 4096
-"""Bytes that are parsed before the loop does something else."""
 SWEEP_S = 0.5
 HANDSHAKE_S = 5.0
 BACKLOG = 128
@@ -62,153 +34,6 @@ FOREIGN = (
     b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Type: text/plain; charset=utf-8\r\n\r\n"
     b"This cockpit is another user's of this machine. `cocoro stop` is for everybody.\n"
 )
-
-
-class Connection(asyncio.Protocol):
-    """A connection that was taken: stands between the transport and the server's protocol, and counts."""
-
-    def __init__(self, door: Door, address: Address, key: str, user: int | None, inner: asyncio.Protocol) -> None:
-        self.address, self.key, self.user = address, key, user
-        self.requests = 0
-        """That have begun."""
-        self.busy = 0
-        """Requests and sockets that are being answered."""
-        self.certificate: dict[str, Any] | None = None
-        """Of the client, as `ssl.SSLSocket.getpeercert` gives it: verified by its authority."""
-        self.received = 0
-        """Bytes."""
-        self.told = False
-        """Whether the log has its end."""
-        self._door, self._inner = door, inner
-        self._loop = door.loop
-        self.since_s = door.swept_s
-        """When it was taken, or its last request was answered, by the door's sweeps."""
-        self._transport: asyncio.Transport | None = None
-        self._stalled_s: float | None = None
-        self._overfed_s: float | None = None
-        self._bytes = Bucket(door.limits.bytes, self._loop.time())
-        self._rest = b""
-        self._timer: asyncio.TimerHandle | None = None
-        self._held = False
-        """Whether the server's protocol has asked for a pause."""
-
-    # --- as the transport sees it -----------------------------------------------------------------
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
-        tls = transport.get_extra_info("ssl_object")
-        if tls is not None:
-            self.certificate = tls.getpeercert() or None
-        self._inner.connection_made(cast(asyncio.Transport, _Facade(self._transport, self)))
-
-    def data_received(self, data: bytes) -> None:
-        self.received += len(data)
-        self._rest += data
-        if self._timer is None:
-            self._hand_on()
-
-    def _hand_on(self) -> None:
-        """Gives the server's protocol a piece; what is left later, when the loop has done something else and the
-        budget allows it."""
-        self._timer = None
-        if self._rest and not self._held and self._transport is not None and not self._transport.is_closing():
-            piece, self._rest = self._rest[:PIECE], self._rest[PIECE:]
-            now_s = self._loop.time()
-            wait_s = self._bytes.owe(now_s, len(piece))
-            if not wait_s:
-                self._overfed_s = None
-            elif self._overfed_s is None:
-                self._overfed_s = self._door.swept_s
-            self._inner.data_received(piece)
-            if self._rest or wait_s:
-                self._timer = self._loop.call_later(wait_s, self._hand_on)
-        self._read_or_not()
-
-    def _read_or_not(self) -> None:
-        if self._transport is None or self._transport.is_closing():
-            return
-        if self._held or self._rest or self._timer is not None:
-            self._transport.pause_reading()
-        else:
-            self._transport.resume_reading()
-
-    def eof_received(self) -> bool | None:
-        return self._inner.eof_received()
-
-    def pause_writing(self) -> None:
-        self._stalled_s = self._door.swept_s
-        self._inner.pause_writing()
-
-    def resume_writing(self) -> None:
-        self._stalled_s = None
-        self._inner.resume_writing()
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._transport, self._rest = None, b""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._door.left(self)
-        self._inner.connection_lost(error)
-
-    # --- as the server's protocol and the gate see it -----------------------------------------------
-
-    def set_protocol(self, inner: asyncio.BaseProtocol) -> None:
-        self._inner = cast(asyncio.Protocol, inner)
-
-    def get_protocol(self) -> asyncio.BaseProtocol:
-        return self._inner
-
-    def hold(self, held: bool) -> None:
-        """What the server's protocol calls pausing and resuming to read."""
-        self._held = held
-        if not held and self._rest and self._timer is None:
-            self._timer = self._loop.call_later(0.0, self._hand_on)
-        self._read_or_not()
-
-    def begins(self) -> None:
-        self.requests += 1
-        self.busy += 1
-
-    def ends(self) -> None:
-        self.busy -= 1
-        self.since_s = self._door.swept_s
-
-    def abort(self) -> None:
-        if self._transport is not None:
-            self._transport.abort()
-
-    def fault(self, now_s: float, limits: DoorLimits) -> str:
-        """Why it must end now; '' when it may stay."""
-        if self._stalled_s is not None and now_s - self._stalled_s > limits.stalled_s:
-            return "takes nothing"
-        if self._overfed_s is not None and now_s - self._overfed_s > limits.overfed_s:
-            return "sends too much"
-        quiet_s = now_s - self.since_s
-        if not self.requests and quiet_s > limits.first_s:
-            return "asks nothing"
-        return "idle" if not self.busy and quiet_s > limits.idle_s else ""
-
-
-class _Facade:
-    """The transport as the server's protocol sees it: a protocol that it sets comes behind the connection."""
-
-    def __init__(self, transport: asyncio.Transport, connection: Connection) -> None:
-        self._transport, self._connection = transport, connection
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._transport, name)
-
-    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
-        self._connection.set_protocol(protocol)
-
-    def get_protocol(self) -> asyncio.BaseProtocol:
-        return self._connection.get_protocol()
-
-    def pause_reading(self) -> None:
-        self._connection.hold(True)
-
-    def resume_reading(self) -> None:
-        self._connection.hold(False)
 
 
 class Door:

@@ -24,6 +24,32 @@ class Rate(NamedTuple):
     burst: float
 
 
+class DoorLimits(NamedTuple):
+    """What connections may cost."""
+
+    connections: int = 96
+    """Open at once."""
+    each: int = 32
+    """Of one address; on loopback, of one user."""
+    takes: Rate = Rate(40.0, 80.0)
+    """New connections of one address or user."""
+    takes_all: Rate = Rate(100.0, 200.0)
+    refusals: Rate = Rate(1000.0, 500.0)
+    """Beyond that the door is closed for SHUT_S, and the kernel lets others wait."""
+    handshakes: int = 8
+    """TLS handshakes at once."""
+    bytes: Rate = Rate(24 * 1024.0, 128 * 1024.0)
+    """Received in one connection, which is read no faster. The page sends 8 KiB/s while somebody drives."""
+    first_s: float = 10.0
+    """Until the first request is whole."""
+    idle_s: float = 20.0
+    """Between two requests."""
+    stalled_s: float = 15.0
+    """For so long a client may take nothing of what waits for it."""
+    overfed_s: float = 10.0
+    """For so long a client may send more than `bytes` without a break."""
+
+
 class Bucket:
     """A budget: `take` succeeds `rate.burst` times at once, and `rate.per_s` times a second in the long run."""
 
@@ -96,7 +122,7 @@ class Audit:
         self._seen: dict[tuple[str, str], tuple[float, int]] = {}
         """By client and kind: when its next line may come, and how often it was refused since the last one."""
         self.refusals = 0
-        self._untold = 0
+        self._untold, self._untold_due_s = 0, 0.0
 
     def refused(self, who: str, what: str, detail: str = "") -> None:
         """`who` is the client's address and key, `what` the kind of refusal, `detail` what this one asked for."""
@@ -104,8 +130,7 @@ class Audit:
         now_s, key = self._clock(), (who, what)
         due_s, count = self._seen.get(key, (now_s, 0))
         if key not in self._seen and len(self._seen) >= self._kinds:
-            self.tell()
-            self._seen = {key: row for key, row in self._seen.items() if row[0] > now_s}
+            self._tell_due(now_s)
             if len(self._seen) >= self._kinds:
                 self._untold += 1
                 return
@@ -122,6 +147,13 @@ class Audit:
     def tell(self) -> None:
         """Logs the numbers that are due. Called now and then, so that the last refusals of a flood are told, too."""
         now_s = self._clock()
+        self._tell_due(now_s)
+        if self._untold and now_s >= self._untold_due_s:
+            log.warning("refused: %d times more, of too many clients to name each", self._untold)
+            self._untold, self._untold_due_s = 0, now_s + self._every_s
+
+    def _tell_due(self, now_s: float) -> None:
+        """Logs the numbers of those whose line is due, and forgets those that have not come again."""
         for (who, what), (due_s, count) in list(self._seen.items()):
             if now_s < due_s:
                 continue
@@ -130,9 +162,6 @@ class Audit:
                 self._line(who, what, "", count - 1)
             else:
                 del self._seen[who, what]
-        if self._untold:
-            log.warning("refused: %d times more, of too many clients to name each", self._untold)
-            self._untold = 0
 
     def _line(self, who: str, what: str, detail: str, more: int) -> None:
         times = f", {more} times more in {self._every_s:.0f} s" if more else ""

@@ -90,6 +90,10 @@ class Passage:
 
     async def _socket(self, scope: Scope, receive: Receive, send: Send, visitor: Visitor) -> None:
         sockets, limits = self._gate.sockets, self._gate.limits
+        if not self._gate.openings.take(visitor.key):
+            refusal = Refusal(429, "too many new sockets", "Too many pages were opened: wait a second.\n")
+            await self._refuse(scope, receive, send, refusal)
+            return
         if sockets.get(visitor.key, 0) >= limits.sockets or sum(sockets.values()) >= limits.sockets_all:
             refusal = Refusal(503, "too many sockets", "Too many pages are open: close one.\n")
             await self._refuse(scope, receive, send, refusal)

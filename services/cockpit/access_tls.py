@@ -75,7 +75,8 @@ class Entrance(NamedTuple):
         scheme = "http" if self.served is None else "https"
         host = self.host
         if ipaddress.ip_address(host).is_unspecified and self.served is not None:
-            host = min(self.served.names - LOOPBACK_NAMES, default="127.0.0.1")
+            others = (self.names | self.served.names) - LOOPBACK_NAMES
+            host = min(others, key=lambda name: (_is_address(name), name), default="127.0.0.1")
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
     def context(self) -> ssl.SSLContext | None:
@@ -127,6 +128,13 @@ def entrance(settings: Settings, now: datetime | None = None) -> Entrance:
     found = Entrance(host, beyond, frozenset(own | served.names), served, folder / CA if settings.site else None)
     found.context()
     return found
+
+
+def _is_address(name: str) -> bool:
+    try:
+        return bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False
 
 
 def _host(text: str) -> str:

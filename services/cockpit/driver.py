@@ -71,8 +71,8 @@ class Driver:
         try:
             request = DriveRequest(task_id=task_id, tick=order.tick, motion=order.motion)
             self._tell(await self._cockpit.node.call(DRIVE, request))
-        except CocoroError as error:
-            self._tell(DriveReply(accepted=False, text=str(error)))
+        except CocoroError as error:  # the old tick moves nothing any more, but shows who asks
+            self._tell(DriveReply(accepted=False, tick=order.tick, text=str(error)))
 
     def _task(self) -> str:
         """The task in which this page drives: the one that it began, or the one that runs."""

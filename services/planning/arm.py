@@ -25,6 +25,8 @@ _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
+_SLOWEST_RADPS = 0.02
+"""Of a joint that moves: 0 would hold it."""
 _ASTRAY_RAD = 0.6
 """A pitch error above this occurs only after babbling."""
 
@@ -55,6 +57,7 @@ class ArmController:
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
         """Clearance of the reference, if it is known."""
+        self._measured: FloatArray = np.zeros(len(ARM))
 
     @property
     def reference(self) -> dict[str, float] | None:
@@ -65,6 +68,7 @@ class ArmController:
         """Start from the measured angles at the next step, because the arm was moved or stopped otherwise."""
         self._reference = None
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
         self._clearance_m = None
 
     def undelivered(self) -> None:
@@ -170,6 +174,7 @@ class ArmController:
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         self._lagged_s = self._lagged_s + dt_s if lags else 0.0
+        self._measured = np.array([measured[name] for name in ARM])
         return self._reference
 
     @property
@@ -219,6 +224,9 @@ class ArmController:
         moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
         # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
+        if self._lagged_s > 0.0:  # all joints arrive at once, so that the hand stays on its way
+            gaps = np.abs(goal - self._measured)
+            speed = np.maximum(gaps * (speed.max() / gaps.max()), _SLOWEST_RADPS)
         self._reference = trial
         self._clearance_m = before_m if blocked or waits else clearance_m
         return ArmStep(goal, speed, trial[ROLL], left, arrived and not (blocked or waits), blocked)

@@ -137,6 +137,8 @@ def _what(motion: Motion, base: BaseCommand) -> str:
     """What happens, in words."""
     if motion.zero:
         return "at rest: nothing is held"
-    if motion.base:
+    if motion.speed_mps:
         return f"driving by hand, {(base.left_mps + base.right_mps) / 2:+.2f} m/s"
+    if motion.base:
+        return "turning by hand"
     return "turning the head" if motion.head else "moving the claws"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, sin
+from math import cos, hypot, sin
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
@@ -245,6 +245,7 @@ class Carrying:
         actuators = snapshot.actuators
         if self._course is None:
             self._course = Course(actuators.robot, actuators.config, grasp_aim(actuators), arm="out")
+            self._label = self._label or held(snapshot)
         x, y, _ = snapshot.body.inverse().apply((*self._place_m, 0.0))
         head = snapshot.look_at((x, y, 0.0))
         if snapshot.holding:
@@ -271,6 +272,19 @@ class Carrying:
         if move.arrived and snapshot.standing:
             plan.state, plan.why = "done", "at the place to put it down"
         return plan
+
+
+HELD_M = 0.15
+
+
+def held(snapshot: Snapshot) -> str:
+    """The known object that the hand seems to hold: the nearest one, seen from above, within `HELD_M`; '' for none. It
+    would else count as an obstacle, in the way of the very hand that carries it."""
+    x, y, _ = hand_place(snapshot)
+    known = snapshot.estimator.memory.all(snapshot.body, snapshot.now_ns)
+    away = {item.label: hypot(item.position_m[0] - x, item.position_m[1] - y) for item in known}
+    nearest = min(away, key=away.__getitem__, default="")
+    return nearest if nearest and away[nearest] < HELD_M else ""
 
 
 def _waiting(move: Move, why: str) -> Move:

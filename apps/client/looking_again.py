@@ -5,12 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, suppress
+from typing import Generic, TypeVar
 
-from apps.cli.link import MeshLink
+from cocoro.contact import Contact
 from cocoro.errors import CocoroError
 from cocoro.messages import ReportRequest, TaskState
+from cocoro.participant import Participant
 from cocoro.topics import REPORT
-from deploy.contact import RECOVERY_S, ProcessContact
+from deploy.contact import RECOVERY_S
+
+P = TypeVar("P", bound=Participant)
 
 EXECUTIVE = "executive"
 LOOK_S = 0.2
@@ -18,29 +22,29 @@ LOOK_S = 0.2
 REJOIN_S = 2.0
 """After so long without contact the mesh is joined anew, by another session, and so often again."""
 LIVING_S = 60.0
-"""Time for which the command looks for an executive whose process lives. One that may have died is looked for during
+"""Time for which the client looks for an executive whose process lives. One that may have died is looked for during
 RECOVERY_S."""
 LATE_S = 5.0
 """After so long without news of the task the executive is asked for it; it tells the task's state 5 times a second."""
 
-Rejoin = Callable[[], AbstractAsyncContextManager[MeshLink]]
+Rejoin = Callable[[], AbstractAsyncContextManager[P]]
 
 
 class LostTaskError(Exception):
     """The outcome of the task is not known; the text says why."""
 
 
-class LookingAgain:
+class LookingAgain(Generic[P]):
     """Asks the executive for one task, over the present link or a fresh one."""
 
-    def __init__(self, link: MeshLink, contact: ProcessContact, rejoin: Rejoin | None) -> None:
+    def __init__(self, link: P, contact: Contact, rejoin: Rejoin[P] | None) -> None:
         self.link = link
         """The link over which the executive was heard last."""
         self._contact = contact
         self._rejoin = rejoin
-        self._joined: AbstractAsyncContextManager[MeshLink] | None = None
+        self._joined: AbstractAsyncContextManager[P] | None = None
 
-    async def ask(self, task_id: str, link: MeshLink | None = None) -> TaskState | None:
+    async def ask(self, task_id: str, link: P | None = None) -> TaskState | None:
         """The task's state by the executive; None when it does not answer. Raises LostTaskError when it does not know
         the task: it has restarted."""
         try:
