@@ -16,6 +16,8 @@ FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update",
 ]  # fmt: skip
+DRIVING = "#app[data-driving]"
+"""What is there while this page drives by hand."""
 SIZES = {"phone": (360, 640), "desk": (1280, 800), "wall": (3840, 2160)}
 
 
@@ -58,3 +60,15 @@ def unfit(page: Page) -> list[str]:
     found = Axe().run(page).response
     assert len(found["passes"]) > 10  # it has looked
     return [f"{fault['id']}: {fault['help']}: {fault['nodes'][0]['html'][:150]}" for fault in found["violations"]]
+
+
+def middle_of(page: Page, selector: str) -> tuple[float, float]:
+    box = page.locator(selector).bounding_box()
+    assert box is not None
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def at_the_middle_of(page: Page, selector: str) -> str:
+    """The id of what a press at the middle of it would meet, or of what holds that."""
+    x, y = middle_of(page, selector)
+    return str(page.evaluate("([x, y]) => document.elementFromPoint(x, y).closest('[id]').id", [x, y]))

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 import pytest
-from browser_rig import browser, opened
+from browser_rig import DRIVING, browser, opened
 from faults_live import PROCESSES, LiveRobot, live
 from operator_shell import PATIENCE_S
 from playwright.sync_api import Browser, Error, Page, expect
@@ -41,7 +41,6 @@ height_m = 0.12
 position_m = [2.6, -0.5]
 """
 """The camera at rest sees the floor from 2.3 m on."""
-DRIVING = "#app[data-driving]"
 expect.set_options(timeout=PATIENCE_S * 1e3)
 
 
