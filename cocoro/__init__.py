@@ -53,9 +53,9 @@ of this package imports what stands above it. Type checkers see all names in `__
 
 def __getattr__(name: str) -> object:
     if name in _LENT:
-        from importlib import import_module
+        from cocoro.entry_points import lent
 
-        return getattr(import_module(_LENT[name]), name)
+        return lent(_LENT[name], name)
     if name not in __all__:  # the name of a module, or an unknown one
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from cocoro import api

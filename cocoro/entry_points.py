@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from importlib import import_module
 from typing import Any, NamedTuple
 
 from cocoro.distributions import may_add_to
@@ -24,6 +25,12 @@ class EntryPoints(NamedTuple):
     added: tuple[Added, ...]
     faults: tuple[str, ...]
     """For each one that could not be loaded, the reason."""
+
+
+def lent(module: str, name: str) -> object:
+    """A name of a module above this package, which lends it to `cocoro`: loaded by name, so that nothing here imports
+    it."""
+    return getattr(import_module(module), name)
 
 
 @cache
