@@ -54,7 +54,7 @@ ARGUMENTS: dict[str, str] = {
     "pki renew": "base --site {name}",
     "pki revoke": "base --site {name}",
     "pki list": "--site {name}",
-    "cockpit invite": "viewer --name {name}",
+    "cockpit invite": "viewer",
     "cockpit end": "{name}",
     "servos set-id": "1 2 --port {name}",
     "servos calibrate": "elbow",

@@ -19,6 +19,7 @@ from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
 from apps.cli.stop_result import StopResult
+from apps.client import seeing
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
@@ -314,7 +315,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     detect: bool,
     words: str,
 ) -> None:
-    monkeypatch.setattr(snapshot, "DETECTIONS_S", 1.0 if not detect else 30.0)
+    monkeypatch.setattr(seeing, "DETECTIONS_S", 1.0 if not detect else 30.0)
     out = tmp_path / "out" / "seen.png"
 
     async def scenario() -> None:

@@ -153,7 +153,7 @@ def test_the_cockpits_own_page_breaks_none_of_its_rules(page: Page) -> None:
         with page.expect_websocket() as socket:
             page.goto(f"http://127.0.0.1:{opened.port}/")
         assert "/live" in socket.value.url
-        page.wait_for_function("performance.getEntriesByType('resource').length > 15")
+        page.wait_for_function("() => performance.getEntriesByType('resource').length > 15")
         assert page.evaluate("() => fetch('/stop', {method: 'POST'}).then(answer => answer.status)") == 200
         assert "POST /stop" in opened.echo.asked
         assert opened.audit.refusals == 0, opened.audit.lines

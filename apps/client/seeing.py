@@ -100,10 +100,12 @@ class FramePairs:
         self._reading.close()
 
     async def take(
-        self, frame_s: float = FRAME_S, detections_s: float = DETECTIONS_S
+        self, frame_s: float = FRAME_S, detections_s: float | None = None
     ) -> tuple[Frame, Detections | None]:
-        """The newest frame with its detections, and closes; without them when perception is silent, or `detections_s`
-        is 0. Raises MeshError when the robot sends no frames."""
+        """The newest frame with its detections, and closes; without them when perception is silent for `detections_s`
+        (by default `DETECTIONS_S`), or that is 0. Raises MeshError when the robot sends no frames."""
+        if detections_s is None:
+            detections_s = DETECTIONS_S
         try:
             if not await within(frame_s, lambda: bool(self._frames or self._pair), self._changed):
                 raise MeshError(f"no frame from the camera within {frame_s:g} s: see `cocoro status`")

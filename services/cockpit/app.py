@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -144,7 +145,8 @@ class App:
             await PlaySocket(cockpit, socket, self._gate, visitor, path).run()
         except CocoroError as error:
             await socket.accept()  # a browser tells its page no reason before that
-            await socket.close(NOT_THERE, str(error).encode()[:REASON_BYTES].decode(errors="ignore"))
+            why = re.sub(r"\S*/(?=\S)", "", str(error))  # the files' names without their folders, which fill the reason
+            await socket.close(NOT_THERE, why.encode()[:REASON_BYTES].decode(errors="ignore"))
 
     def _visitor(self, scope: Any, doing: Doing) -> Visitor | None:
         """Who asks, if he may do that."""
