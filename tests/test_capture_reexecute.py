@@ -106,6 +106,19 @@ def test_the_first_difference_is_told_with_its_place_and_size(
     assert "1 steps differ" in capsys.readouterr().out
 
 
+def test_a_topic_that_no_recorded_step_has_published_is_new_and_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sees(Changed):
+        def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+            seen = Detections(frame_seq=0, frame_incarnation=0, width=1, height=1)
+            return [*super().step(inputs, now_ns), Output(topics.DETECTIONS, seen)]
+
+    make = planning.core
+    use_core(monkeypatch, planning, lambda *args: Sees(make(*args), lambda _: None, Detections, 0))
+    result = again(GOLDEN, "planning", TOLERANCE)
+    assert result.differing == 0
+    assert "perception/detections is new: not compared" in result.changed
+
+
 def test_outputs_that_are_missing_or_too_many_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     class Mute(Changed):
         def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:

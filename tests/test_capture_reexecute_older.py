@@ -82,7 +82,6 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: model is new: gets its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: gets its default",
         "calliope/executive/intent: Intent has changed: its former shape is converted",
-        "planning/map is new: not compared",
     }
     assert any("changed since, calliope/planning/status: model is new" in line for line in describe_result(result))
 

@@ -55,7 +55,7 @@ def test_what_a_profile_needs_comes_from_who_publishes_and_who_reads_frames() ->
     publisher = shared.POOL_BYTES + shared.PROCESS_BYTES + shared.SESSION_BYTES
     for name in ("sim", "sim-wire", "robot"):
         assert shared_bytes(profiles.read(name).rows()) == publisher + 3 * shared.SESSION_BYTES
-    assert shared_bytes(profiles.read("replay").rows()) == shared.SESSION_BYTES
+    assert shared_bytes(profiles.read("replay").rows()) == 2 * shared.SESSION_BYTES
     assert shared_bytes([]) == 0
     other = Component(name="stereo", module="x", services=("stereo",), doc="Another camera.", frames="publishes")
     assert shared_bytes([*profiles.read("sim").rows(), other]) == 2 * publisher + 3 * shared.SESSION_BYTES
