@@ -100,8 +100,10 @@ class Driving:
                 await self._ask(self.motion)  # the first motion after a pause: now there is a tick
             took_s = asyncio.get_running_loop().time() - begun_s
             wait_s = max(self._period_s - took_s, 0.0) if self._moved else IDLE_S
+            # Python 3.11's `wait_for` loses a cancellation that comes together with the news.
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._news.wait(), wait_s)
+                async with asyncio.timeout(wait_s):
+                    await self._news.wait()
 
     async def _ask(self, motion: Motion) -> None:
         request = DriveRequest(task_id=self.task_id, tick=self.reply.tick, motion=motion)

@@ -128,7 +128,8 @@ class SupervisedProcess:
         self._signal(signal.SIGTERM)
         self._signal(signal.SIGCONT)  # a stopped process could not handle SIGTERM
         with suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(self._exit), self.row.stop_s)
+            async with asyncio.timeout(self.row.stop_s):
+                await asyncio.shield(self._exit)
         if self._exit.done():
             self._report(f"{self.row.name} stopped")
             return

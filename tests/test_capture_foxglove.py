@@ -45,7 +45,7 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> 
                 recorded.setdefault(channel.topic, []).append(json.loads(message.data))
     assert {
         "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
-        "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
+        "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log", "foxglove.Grid",
     } == set(shown)  # fmt: skip
     assert len(shown["foxglove.CompressedImage"]) == 60
     assert len(recorded["calliope/base/state"]) == 300

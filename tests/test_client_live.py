@@ -119,7 +119,7 @@ async def a_program_that_ends_by(robot: LiveRobot, number: signal.Signals) -> st
 
 def test_programs_operate_a_live_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario() -> None:
-        async with live(tmp_path, name=NAME) as robot:
+        async with live(tmp_path, name=NAME, pace=1.0, frame_rate_hz=15.0) as robot:
             monkeypatch.setenv("COCORO_RUN_DIR", robot.env["COCORO_RUN_DIR"])
             with pytest.raises(MeshError, match="did you mean client"):
                 await cocoro.connect("clinet").__aenter__()
@@ -148,7 +148,9 @@ def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path, monke
     monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path / "captures"))
 
     async def scenario() -> None:
-        async with live(tmp_path, name="notebook", processes=("capture", *PROCESSES)) as robot:
+        async with live(
+            tmp_path, name="notebook", processes=("capture", *PROCESSES), pace=1.0, frame_rate_hz=15.0
+        ) as robot:
             environment = robot.env | {"MPLBACKEND": "agg", "PYTHONPATH": str(ROOT)}
             command = [sys.executable, str(ROOT / "tests" / "notebook_rig.py"), str(NOTEBOOK)]
             done = await asyncio.to_thread(

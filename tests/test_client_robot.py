@@ -174,6 +174,16 @@ async def test_it_is_driven_by_hand_for_as_long_as_a_program_says() -> None:
 
 
 @in_virtual_time
+async def test_a_program_that_lets_go_right_after_a_motion_has_let_go() -> None:
+    async with RobotRig() as rig, operated(rig) as robot:
+        async with robot.drive() as drive:
+            await drive.move(cocoro.Motion(turn_radps=0.2), for_s=0.5)
+            left_s = rig.now_s
+        assert rig.now_s - left_s < 2.0, "the task does not wait until it has been left alone for long"
+        await robot.park()
+
+
+@in_virtual_time
 async def test_the_emergency_stop_fails_the_task_and_refuses_others_until_the_reset() -> None:
     async with RobotRig() as rig, operated(rig) as robot:
         task = robot.go_to("red_can")

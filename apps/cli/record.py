@@ -88,7 +88,8 @@ async def record_mesh(
                 node.on(RECORDING.of(name), display.show)
                 await _run_until(component.run(node, config), end, display.failed, seconds)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(display.ended.wait(), END_S)
+                    async with asyncio.timeout(END_S):
+                        await display.ended.wait()
     return display.finish()
 
 
