@@ -227,6 +227,33 @@ def test_sizes_and_rates_are_limited_where_a_message_comes_in(room: Room) -> Non
     assert room.heard.count("r/fast") == 20, "other keys are not slowed down"
 
 
+QUESTIONS = {
+    "downsampling": [
+        {"id": "rate", "link_protocols": ["tls"], "flows": ["ingress"], "messages": ["query"],
+         "rules": [{"key_expr": "r/stop", "freq": 0.01}]}
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("room", [QUESTIONS], indirect=True)
+def test_who_asks_too_often_has_nobody_elses_questions_dropped(room: Room) -> None:
+    """A flood of stops on one link must not deny the stop of another person."""
+    asked: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            asked.append(str(query.payload))
+            query.reply("r/stop", b"stopped")
+
+    with room.peer.declare_queryable("r/stop", answer):
+        eve, ada = room.client("eve"), room.client("ada")
+        until(lambda: list(eve.get("r/stop", payload="", timeout=0.2)), "the first of a link passes")
+        for _ in range(50):
+            assert not list(eve.get("r/stop", payload="", timeout=0.02)), "one in a hundred seconds"
+        assert list(ada.get("r/stop", payload="", timeout=SECOND_S)), "another link has its own limit"
+    assert len(asked) == 2
+
+
 EVENTS = {
     "qos/network": [
         {"id": "events", "link_protocols": ["tls"], "flows": ["egress"], "messages": ["put"],
