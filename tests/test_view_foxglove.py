@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import os
+import socket
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from ipaddress import ip_address
@@ -239,13 +242,40 @@ def test_a_head_without_an_end_or_of_trickery_is_not_let_through() -> None:
     async def run() -> int:
         async with Door("127.0.0.1", 0, ("127.0.0.1", 1)) as door:
             reader, writer = await asyncio.open_connection("127.0.0.1", door.port)
-            writer.write(b"x" * 3 * HEAD_BYTES)
-            left = len(await reader.read())
-            writer.close()
-            return left
+            try:
+                writer.write(b"x" * 3 * HEAD_BYTES)
+                return len(await reader.read())
+            finally:
+                writer.transport.abort()
 
     with suppress(ConnectionError):
         assert asyncio.run(run()) == 0
+
+
+def test_a_door_that_shuts_leaves_no_socket_of_a_viewer_who_takes_nothing() -> None:
+    async def flood(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError):
+            while True:
+                writer.write(bytes(HEAD_BYTES))
+                await writer.drain()
+                flooded.append(HEAD_BYTES)
+
+    async def run() -> None:
+        inner = await asyncio.start_server(flood, "127.0.0.1", 0)
+        async with inner, Door("127.0.0.1", 0, inner.sockets[0].getsockname()[:2]) as door:
+            viewer.connect(("127.0.0.1", door.port))
+            viewer.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            before = -1
+            while len(flooded) > before:  # until every buffer on the way is full
+                before = len(flooded)
+                await asyncio.sleep(0.1)
+
+    flooded: list[int] = []
+    with socket.socket() as viewer, warnings.catch_warnings(record=True) as left:
+        warnings.simplefilter("always", ResourceWarning)
+        asyncio.run(run())
+        gc.collect()
+    assert not [str(one.message) for one in left]
 
 
 def test_the_server_itself_hides_at_another_address_each_time() -> None:

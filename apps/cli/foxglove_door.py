@@ -97,6 +97,9 @@ class Door:
         try:
             with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
                 await self._let_through(reader, writer)
+        except asyncio.CancelledError:  # the door shuts: what a viewer has not taken by now is not waited for
+            writer.transport.abort()
+            raise
         finally:
             self._open.discard(passing)
             writer.close()
@@ -122,6 +125,9 @@ class Door:
         ]
         try:
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            their_writer.transport.abort()
+            raise
         finally:
             for way in ways:
                 way.cancel()
