@@ -66,7 +66,7 @@ class Track:
 def sightings(capture: Path, label: str) -> list[Sighting]:
     """The sightings of an object in a capture."""
     robot = Robot.load()
-    chain = robot.chain("camera")
+    chain = robot.camera_chain
     heads: list[tuple[int, tuple[float, ...]]] = []
     bodies: list[tuple[int, tuple[float, ...]]] = []
     seen: list[tuple[int, tuple[float, ...]]] = []

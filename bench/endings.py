@@ -34,9 +34,11 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.tasks import Task
 from services.executive.tasks import ParkTask, PutDownTask
-from services.planning.hand import CLAWS
 from sim.motion import MotionRow, read_motion
 
+ROBOT = Robot.load()
+CLAWS = ROBOT.jaws
+CLAW_LINKS = {ROBOT.link_of(jaw) for jaw in CLAWS}
 BOUND_S = 0.5
 STANDING_MPS = 0.01
 RESTING_RAD = 0.015
@@ -89,7 +91,7 @@ class Watched:
 
     def claws_touch(self) -> bool:
         """Whether a claw touches an object, by the newest truth."""
-        return any(set(CLAWS) & set(item.touching) for item in self.truths[-1].objects)
+        return any(CLAW_LINKS & set(item.touching) for item in self.truths[-1].objects)
 
     def body_rest_s(self, since_ns: int) -> float:
         moving = [row.sim_ns for row in self.rows if row.sim_ns > since_ns and row.moves_mps >= STANDING_MPS]

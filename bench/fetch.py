@@ -19,7 +19,6 @@ from bench.report import Report, Table, number, spread
 from cocoro.robot import Robot
 from cocoro.tasks import Limits
 from services.executive.tasks import FetchTask
-from services.planning.arm import OUT, ROLL
 from services.planning.behaviours.base import Actuators
 from services.planning.behaviours.driving import grasp_aim
 from services.planning.config import PlanningConfig
@@ -79,17 +78,18 @@ class FetchLimits:
             grasp.around.height_m + config.arm.carry_rise_m,
             config.arm.pitch_rad,
         )
-        parked = robot.poses["park"] | {ROLL: 0.0}
-        out = parked | OUT | {ROLL: robot.claw.level_roll_rad}
+        roll = robot.arm.roll
+        parked = robot.poses["park"] | {roll: 0.0}
+        out = parked | robot.poses["unfolded"] | {roll: robot.claw.level_roll_rad}
         behind, around, up = (self._joints(pose) for pose in (grasp.behind, grasp.around, lifted))
         # The wheel on the outer side drives the way and its share of the turn.
         outer_m = abs(offset.ahead_m) + abs(offset.heading_rad) * base.wheel_separation_m / 2
         drive_s = ramp_s(outer_m, base.max_wheel_speed_mps, base.wheel_acceleration_mps2)
         unfold_s = self._servos_s(parked, out) + self._servos_s(out, behind)
         beside_rad = max(abs(atan2(place_m[1], place_m[0])) - kinect.horizontal_fov_rad / 2, 0.0)
-        claws = dict.fromkeys(robot.claw.open_sign, config.hand.open_rad)
+        claws = dict.fromkeys(robot.jaws, config.hand.open_rad)
         return {
-            "search": beside_rad / robot.joints["neck_pan"].max_speed_radps
+            "search": beside_rad / robot.joints[robot.head.pan].max_speed_radps
             + PICTURES / kinect.rate_hz
             + FRAME_LATENCY_S,
             "approach": max(drive_s, unfold_s),
@@ -100,7 +100,9 @@ class FetchLimits:
         }
 
     def _joints(self, pose: HandPose) -> dict[str, float]:
-        start = OUT | {"arm_base": 0.0, ROLL: self._robot.claw.level_roll_rad}
+        robot = self._robot
+        level = {robot.arm.azimuth: 0.0, robot.arm.roll: robot.claw.level_roll_rad}
+        start = robot.poses["unfolded"] | level
         solved = self._actuators.reacher.solve(start, pose)
         if solved is None:
             raise ValueError(f"the arm does not reach {pose}")

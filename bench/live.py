@@ -97,7 +97,7 @@ class Fetched(NamedTuple):
 
 async def _fetch(cocoro: Operator) -> Fetched:
     """One fetch, judged a while after its end, so that a slipping can counts as lost."""
-    judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
+    judge = Judge(Robot.load(), find_scene("paper", 0, "red_can"), "red_can")
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
         Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,

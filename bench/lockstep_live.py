@@ -99,7 +99,7 @@ async def _in_lockstep(cocoro: Operator, time_s: float) -> None:
 
 
 async def _fetch(cocoro: Operator, stack: AsyncExitStack) -> LiveRun:
-    judge, stamps = Judge(find_scene("paper", 0, LABEL), LABEL), list[int]()
+    judge, stamps = Judge(Robot.load(), find_scene("paper", 0, LABEL), LABEL), list[int]()
     bus = await stack.enter_async_context(await ZenohBus.open(cocoro.run_dir.join_as("bench")))
     node = await stack.enter_async_context(Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME))
     node.on(topics.TRUTH, judge.feed)

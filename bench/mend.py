@@ -75,7 +75,7 @@ class _Watch:
 
     def __init__(self, node: Node, motion: Path) -> None:
         self._motion = motion
-        self._judge = Judge(find_scene("paper", 0, LABEL), LABEL)
+        self._judge = Judge(node.robot, find_scene("paper", 0, LABEL), LABEL)
         self._states: list[TaskState] = []
         self._news = asyncio.Event()
         self._blow_ns = 0

@@ -82,7 +82,7 @@ class Ours:
 def check(method: str, found: Sequence[Found], shown: Scene, robot: Robot, *, placed: bool = True) -> None:
     """Raise ValueError unless every object is found where it is, and with `placed` its centre, too."""
     camera = robot.camera.scaled(shown.frames[0].width, shown.frames[0].height)
-    head = robot.chain("camera").pose({"neck_pan": PAN, "neck_tilt": TILT})
+    head = robot.camera_chain.pose({"neck_pan": PAN, "neck_tilt": TILT})
     seen = {one.label: one for one in found}
     for known, place_m in zip(shown.catalogue, shown.places_m, strict=True):
         one = seen.get(known.label)

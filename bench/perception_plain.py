@@ -42,7 +42,7 @@ class PlainOpenCV:
         self._scene = scene
         self._crop = crop
         self._camera = robot.camera.scaled(scene.frames[0].width, scene.frames[0].height)
-        self._head = robot.chain("camera").pose({"neck_pan": PAN, "neck_tilt": TILT})
+        self._head = robot.camera_chain.pose({"neck_pan": PAN, "neck_tilt": TILT})
         self._table = robot.depth_m(np.arange(2048, dtype=np.uint16))
         self._shift_px_m = -self._camera.fx * robot.kinect.depth_offset_m[0]
         limits = [np.clip(np.rint(box), 0, 255) for box in scene.hsv]
@@ -103,7 +103,7 @@ class PaperNumpy:
         self._scene = scene
         self._table = robot.depth_m(np.arange(2048, dtype=np.uint16))
         self._camera = robot.camera.scaled(scene.frames[0].width, scene.frames[0].height)
-        self._head = robot.chain("camera").pose({"neck_pan": PAN, "neck_tilt": TILT})
+        self._head = robot.camera_chain.pose({"neck_pan": PAN, "neck_tilt": TILT})
         scale, offset = np.array([255 / 100, 1.0, 1.0]), np.array([0.0, 128.0, 128.0])
         self._ranges = [
             np.clip(np.rint(np.array([known.lab[0].low, known.lab[0].high]) * scale + offset), 0, 255).astype(np.uint8)

@@ -132,7 +132,7 @@ def scene(robot: Robot, count: int, frames: int, size: tuple[int, int] = (640, 4
     """A scene of `count` objects, at most `MOST`, in so many frames, each with noise of its own."""
     catalogue, hsv = known_objects(count)
     camera = robot.camera.scaled(*size)
-    head = robot.chain("camera").pose({"neck_pan": PAN, "neck_tilt": TILT})
+    head = robot.camera_chain.pose({"neck_pan": PAN, "neck_tilt": TILT})
     draws = np.random.default_rng(4)
     cells = draws.permutation(_COLUMNS * _ROWS)[:count]
     poses, visuals = np.tile(np.eye(4), (count, 1, 1)), []

@@ -58,7 +58,7 @@ async def disturbed_fetch(
 ) -> Disturbed | None:
     """One fetch by the operator. `disturb` begins a disturbance, and returns when it is over. None when the phase did
     not come."""
-    judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
+    judge = Judge(Robot.load(), find_scene("paper", 0, "red_can"), "red_can")
     came = asyncio.Event()
 
     def on_task(state: TaskState) -> None:

@@ -154,7 +154,7 @@ class Lab:
 
     async def fetch(self, label: str = "red_can") -> Fetched:
         """The operator fetches an object; judged a while after the end, so that a slipping can counts as lost."""
-        judge = Judge(find_scene("paper", 0, label), label)
+        judge = Judge(Robot.load(), find_scene("paper", 0, label), label)
         async with self.observer() as node:
             node.on(topics.TRUTH, judge.feed)
             code, said, seconds = await asyncio.to_thread(

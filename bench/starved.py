@@ -62,7 +62,7 @@ class Trial(NamedTuple):
 
 
 async def _fetch(cocoro: Operator) -> tuple[Trial, str]:
-    judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
+    judge = Judge(Robot.load(), find_scene("paper", 0, "red_can"), "red_can")
     pauses: Counter[str] = Counter()
     before = ""
 

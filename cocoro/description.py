@@ -58,6 +58,33 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
 
 
+class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The joints that turn the camera."""
+
+    pan: str
+    """About the vertical, counter-clockwise positive."""
+    tilt: str
+    """Down positive."""
+
+
+class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the names of joints and links of the arm and the hand stand for."""
+
+    joints: Annotated[tuple[str, ...], Meta(min_length=2)]
+    """Those that bring the hand to a place, from the body out. The first one turns the arm about the vertical."""
+    bend: str
+    """The joint whose sign tells one way of reaching a place from the other. `pose.upright` has the sign to keep."""
+    roll: str
+    """It turns the hand about the hand's own axis. The hand begins at the link that it moves."""
+    tip: str
+    """The link whose origin goes to a target's centre. Its z axis points along the hand."""
+
+    @property
+    def azimuth(self) -> str:
+        """The joint that turns the arm about the vertical."""
+        return self.joints[0]
+
+
 class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width: int
     height: int
@@ -76,6 +103,8 @@ class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Calibration of both lenses. The driver rectifies its images; readers of frames use the fields of view above."""
     depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
     """Rotation vector from the depth camera's frame to the colour camera's."""
+    link: str = "camera"  # what it was called before it could be called otherwise
+    """The link that carries it, whose frame is the colour camera's: x right, y down, z forward."""
 
 
 class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,7 +130,11 @@ class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     open_sign: dict[str, float]
     """By joint, the sign of the angles towards which it opens."""
     level_roll_deg: float
-    """The wrist roll at which the claws lie level, for upright targets; the marker then stands above the hand."""
+    """The hand's roll at which the claws lie level, for upright targets; the marker then stands above the hand."""
+    pad_gap_m: Positive
+    """Distance of the pads at angle 0 of the claws, at which they are parallel."""
+    pad_height_m: Positive
+    pad_thickness_m: Positive
 
     @property
     def level_roll_rad(self) -> float:
@@ -129,6 +162,44 @@ class Hull(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """By claw link, the angle in its x-y plane from its x axis to its finger."""
     tube: Annotated[list[Tube], Meta(min_length=1)]
     """From the chassis out. The first one turns on the chassis and is not checked against it."""
+
+
+Shape = Literal["box", "sphere", "cylinder"]
+
+
+class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One primitive, rigidly attached to a link."""
+
+    name: str
+    link: str
+    """`body` is the chassis. What is solid there can be touched by itself, under its own name."""
+    shape: Shape
+    size_m: tuple[float, ...]
+    """Box: its three sides; cylinder: radius and height; sphere: radius."""
+    position_m: Vec3 = (0.0, 0.0, 0.0)
+    """Centre, in the link's frame."""
+    rgb: Vec3 = (0.45, 0.45, 0.46)
+    mass_kg: Annotated[float, Meta(ge=0)] = 0.0
+    axis: Literal["x", "y", "z"] = "z"
+    """Axis of the link along which a cylinder lies."""
+    solid: bool = True
+    """Whether it collides."""
+
+    def __post_init__(self) -> None:
+        sides = {"box": 3, "cylinder": 2, "sphere": 1}[self.shape]
+        if len(self.size_m) != sides or min(self.size_m) <= 0.0:
+            raise ValueError(f"part {self.name}: size_m of a {self.shape} is {sides} lengths, not {self.size_m}")
+
+
+class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the simulator builds the robot of, besides chassis, wheels, mount, marker and pads, which follow from other
+    tables."""
+
+    mount_mass_kg: Annotated[float, Meta(ge=0)]
+    part: list[Part]
+    touching: list[tuple[str, str]] = []
+    """Links that touch though no joint is between them: they do not collide. A part of the body is its own link, and
+    `mount` is the mount."""
 
 
 class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -178,17 +249,32 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     base: Base
     kinect: Kinect
+    head: Head
     link: list[LinkRow]
+    arm: Arm
     marker: Marker
     network: dict[Literal["arm", "hand"], Network]
     joint: list[Joint]
     claw: Claw
     hull: Hull
     pose: dict[str, dict[str, float]]
+    solid: Solid
 
     def __post_init__(self) -> None:
-        """Refuses references to links and joints that the description does not have, circles of links, and boxes whose
-        corners are swapped."""
+        """Refuses what contradicts itself: names of links and joints that the description does not have, circles of
+        links, limbs whose joints move nothing, poses without a joint that they need, boxes whose corners are
+        swapped."""
+        self._check_links()
+        self._check_places()
+        self._check_limbs()
+        for where, low_m, high_m in (
+            ("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m),
+            ("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m),
+        ):
+            if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
+                raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+
+    def _check_links(self) -> None:
         parents = {row.name: row.parent for row in self.link}
         joints = {joint.name for joint in self.joint}
         for row in self.link:
@@ -202,22 +288,37 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 above = parents[above]
             if row.joint is not None and row.joint not in joints:
                 raise ValueError(f"link {row.name}: there is no joint {row.joint!r}")
-        hull = [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
-        hull += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
-        for where, name in [("marker", self.marker.link), *hull]:
-            if name not in parents:
+
+    def _check_places(self) -> None:
+        links = {row.name for row in self.link}
+        places = [("marker", self.marker.link), ("arm.tip", self.arm.tip), ("kinect.link", self.kinect.link)]
+        places += [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
+        places += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
+        places += [(f"part {part.name}", part.link) for part in self.solid.part if part.link != "body"]
+        for where, name in places:
+            if name not in links:
                 raise ValueError(f"{where}: there is no link {name!r}")
-        for where, low_m, high_m in (
-            ("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m),
-            ("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m),
-        ):
-            if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
-                raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+        named = {"mount", *links, *(part.name for part in self.solid.part if part.link == "body" and part.solid)}
+        if unknown := sorted({link for pair in self.solid.touching for link in pair} - named):
+            raise ValueError(f"solid.touching: there is no link {unknown[0]!r}")
+
+    def _check_limbs(self) -> None:
+        arm, joints = self.arm, {joint.name for joint in self.joint}
+        limbs = [("claw", set(self.claw.open_sign)), ("head", {self.head.pan, self.head.tilt})]
+        limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
-        claws = [("claw", set(self.claw.open_sign)), ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]
-        for where, named in [*poses, *claws]:
+        for where, named in [*poses, *limbs, ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]:
             if unknown := sorted(named - joints):
                 raise ValueError(f"{where}: there is no joint {unknown[0]!r}")
+        moved = {row.joint for row in self.link}
+        for where, named in limbs:
+            if idle := sorted(named - moved):
+                raise ValueError(f"{where}: the joint {idle[0]!r} moves no link")
+        if arm.bend not in arm.joints:
+            raise ValueError(f"arm: bend = {arm.bend!r} is none of its joints {', '.join(arm.joints)}")
+        for name, wanted in (("park", arm.joints), ("upright", arm.joints), ("unfolded", arm.joints[1:])):
+            if missing := [joint for joint in wanted if joint not in self.pose.get(name, {})]:
+                raise ValueError(f"pose {name}: the angle of {missing[0]!r} is missing")
 
 
 def read(path: Path | None, override: Path | None) -> Description:
@@ -245,11 +346,13 @@ def completed(data: Any) -> Any:
     if not isinstance(data, dict):
         return data
     claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
-    if "hull" not in data or (isinstance(claw, dict) and "level_roll_deg" not in claw):
-        own = tomllib.loads(_own_text())
-        data = {"hull": own["hull"], **data}
-        if isinstance(claw, dict):
-            data["claw"] = {"level_roll_deg": own["claw"]["level_roll_deg"], **claw}
+    own = tomllib.loads(_own_text())
+    for table in ("hull", "head", "arm", "solid"):
+        data = {table: own[table], **data}
+    if isinstance(claw, dict):
+        data["claw"] = {name: value for name, value in own["claw"].items() if name != "open_sign"} | claw
+    if isinstance(poses := data.get("pose"), dict):
+        data["pose"] = {name: own["pose"][name] for name in ("unfolded", "upright")} | poses
     if isinstance(networks, dict) and isinstance(base, dict) and "command_timeout_s" in base:
         timeout = {"command_timeout_s": base["command_timeout_s"]}
         networks = {name: timeout | row if isinstance(row, dict) else row for name, row in networks.items()}

@@ -52,11 +52,14 @@ class Robot:
         self.name = spec.name
         self.base = spec.base
         self.kinect = spec.kinect
+        self.head = spec.head
+        self.arm = spec.arm
         self.marker = spec.marker
         self.networks: dict[str, Network] = {str(name): row for name, row in spec.network.items()}
         self.claw = spec.claw
         self.hull = spec.hull
         self.poses = spec.pose
+        self.solid = spec.solid
         self.joints = {joint.name: joint for joint in spec.joint}
         self.links = {
             row.name: Link(
@@ -111,6 +114,27 @@ class Robot:
         """The joints of one servo network, in the order of their servo IDs."""
         rows = [joint for joint in self.joints.values() if joint.network == network]
         return tuple(joint.name for joint in sorted(rows, key=lambda joint: joint.id))
+
+    @cached_property
+    def jaws(self) -> tuple[str, ...]:
+        """The joints that close the hand."""
+        return tuple(self.claw.open_sign)
+
+    def link_of(self, joint: str) -> str:
+        """The link that a joint moves. Raises KeyError naming a joint that moves none."""
+        for link in self.links.values():
+            if link.joint == joint:
+                return link.name
+        raise KeyError(f"joint {joint!r} moves no link")
+
+    @cached_property
+    def camera_chain(self) -> Chain:
+        """From the body to the colour camera's frame: x right, y down, z forward."""
+        return self.chain(self.kinect.link)
+
+    def head_angles(self, pan_rad: float = 0.0, tilt_rad: float = 0.0) -> dict[str, float]:
+        """The angles of the head's joints, rad, by their names."""
+        return {self.head.pan: pan_rad, self.head.tilt: tilt_rad}
 
     def chain(self, tip: str) -> Chain:
         """The links from the body to the tip. Raises KeyError naming a link that is missing."""

@@ -10,14 +10,14 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from sim.base import Bumper
-from sim.body import CHASSIS
+from sim.body import CASTERS, CHASSIS, WHEELS
 from sim.stage import FLOOR
 
 BUMPER_HALF_DEG = 90.0
 """The bumper covers the front half of the chassis."""
 BUMPER_OVERLAP_DEG = 20.0
 """A contact within this angle of straight ahead closes both switches."""
-ROLLS_ON_FLOOR = frozenset({"wheel_left", "wheel_right", "caster_front", "caster_rear"})
+ROLLS_ON_FLOOR = frozenset({*WHEELS, *CASTERS})
 
 ContactPair = tuple[str, str]
 
@@ -59,10 +59,11 @@ def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray
     return Bumper(left, right)
 
 
-def collisions(pairs: Iterable[ContactPair], links: frozenset[str], objects: frozenset[str]) -> tuple[str, ...]:
+def collisions(
+    pairs: Iterable[ContactPair], links: frozenset[str], claws: frozenset[str], objects: frozenset[str]
+) -> tuple[str, ...]:
     """Unwanted contacts of the robot as 'link~other', sorted: all except wheels and casters on the floor, claws on an
     object, and the claws on each other."""
-    claws = {link for link in links if link.startswith("claw_")}
     return tuple(
         sorted(
             f"{one}~{other}"

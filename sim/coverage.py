@@ -50,7 +50,7 @@ class CoverageJudge:
 
     def __init__(self, robot: Robot, scene: Scene, radius_m: float) -> None:
         self._robot, self._scene, self._radius_m = robot, scene, radius_m
-        self._chain = robot.chain("camera")
+        self._chain = robot.camera_chain
         self._depth_offset_m = np.array(robot.kinect.depth_offset_m)
         self._start: FloatArray | None = None
         self._cells_m = np.zeros((0, 2))

@@ -21,7 +21,6 @@ HELD_S = 2.0
 TILTED_DEG = 30.0
 MOVED_M = 0.05
 STANDING_DEG = 5.0
-CLAWS = frozenset({"claw_left", "claw_right"})
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,8 +51,9 @@ class Judge:
     in the scene.
     """
 
-    def __init__(self, scene: Scene, target: str = "") -> None:
+    def __init__(self, robot: Robot, scene: Scene, target: str = "") -> None:
         self._scene = scene
+        self._jaws = frozenset(robot.link_of(jaw) for jaw in robot.jaws)
         self._target = scene.object(target).label if target else ""
         self._first: dict[str, Vec3] = {}
         self._first_bottom_m = 0.0
@@ -111,7 +111,7 @@ class Judge:
             self._feed_target(item, known, fresh=first is item.position_m)
             if not self._grasped:
                 self._moved_m = max(self._moved_m, moved_m)
-        if first is item.position_m and set(item.touching) >= CLAWS:
+        if first is item.position_m and set(item.touching) >= self._jaws:
             self._carried.add(item.label)
         if known.kinematic or item.label in self._carried or (is_target and self._grasped):
             return
@@ -122,8 +122,8 @@ class Judge:
         self._bottom_m = item.position_m[2] - _bottom_depth_m(known, item)
         if fresh:
             self._first_bottom_m = self._bottom_m
-        self._grasped |= set(item.touching) >= CLAWS
-        if self._bottom_m < HELD_HEIGHT_M or set(item.touching) != CLAWS:
+        self._grasped |= set(item.touching) >= self._jaws
+        if self._bottom_m < HELD_HEIGHT_M or set(item.touching) != self._jaws:
             self._held_since_ns = None
         elif self._held_since_ns is None:
             self._held_since_ns = self._now_ns
@@ -205,7 +205,7 @@ class PursuitJudge:
         self._poses: deque[tuple[int, FloatArray]] = deque(maxlen=5)
         """Stamps and poses (x, y, yaw), from which speeds are taken."""
         self._camera = robot.camera
-        self._chain = robot.chain("camera")
+        self._chain = robot.camera_chain
         self._radius_m = scene.object(target).dimensions_m[0]
         self._target = target
         self._begun = False

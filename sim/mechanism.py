@@ -12,9 +12,9 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
-from sim.body import CHASSIS
+from sim.body import CHASSIS, WHEELS
 from sim.bullet import Bullet
-from sim.model import WHEELS, RobotModel, write_urdf
+from sim.model import RobotModel, write_urdf
 from sim.rigid import rotation, rotations
 from sim.scene import Start
 from sim.servos import Drive

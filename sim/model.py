@@ -10,34 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.description import Part
 from cocoro.kinematics import Link, turn_z
 from cocoro.robot import Robot
-from sim.body import CHASSIS, Extra, Part, SimBody, calliope_body
+from sim.body import CHASSIS, Extra, SimBody, body_of_parts, inertia_of, pose_of
 from sim.render.interface import Visual
-
-WHEELS = ("wheel_left", "wheel_right")
-
-_NEIGHBOURS = {
-    # Pairs of links that touch at their joint or turn inside each other. Every other pair may collide.
-    frozenset(pair)
-    for pair in (
-        (CHASSIS, "arm_base"),
-        ("riser", "arm_base"),
-        ("riser", "shoulder"),
-        ("arm_base", "shoulder"),
-        ("arm_base", "elbow"),
-        ("shoulder", "elbow"),
-        ("elbow", "wrist_pitch"),
-        ("wrist_pitch", "wrist_roll"),
-        ("wrist_pitch", "claw_left"),
-        ("wrist_pitch", "claw_right"),
-        ("wrist_roll", "claw_left"),
-        ("wrist_roll", "claw_right"),
-        ("neck_pan", "neck_tilt"),
-        ("mount", "neck_pan"),
-    )
-}
-_FIXED = frozenset({CHASSIS, "mount", "riser", *WHEELS, "caster_front", "caster_rear"})
 
 
 @dataclass(frozen=True)
@@ -50,12 +27,15 @@ class RobotModel:
     body: SimBody
     carried: dict[str, tuple[str, FloatArray]]
     """For each link of the description: the URDF link that carries it, and its pose (4, 4) in that link."""
+    touching: frozenset[frozenset[str]]
+    """Pairs of links that touch at a joint or turn inside each other. Every other pair may collide."""
 
     def collision_pairs(self) -> Iterator[tuple[str, str]]:
         """Pairs of the robot's own links that can collide."""
+        fixed = {CHASSIS, *(extra.name for extra in self.body.extras)}
         for i, one in enumerate(self.links):
             for other in self.links[i + 1 :]:
-                if frozenset((one, other)) not in _NEIGHBOURS and not {one, other} <= _FIXED:
+                if frozenset((one, other)) not in self.touching and not {one, other} <= fixed:
                     yield one, other
 
     def visuals(self) -> list[tuple[str, FloatArray, Visual]]:
@@ -63,9 +43,9 @@ class RobotModel:
         found = []
         for link, parts in self.body.parts.items():
             carrier, offset = self.carried.get(link, (link, np.eye(4)))
-            found += [
-                (carrier, offset @ part.pose(), Visual(part.name, part.shape, part.size_m, part.rgb)) for part in parts
-            ]
+            for part in parts:
+                visual = Visual(part.name, part.shape, part.size_m, part.rgb)
+                found.append((carrier, offset @ pose_of(part), visual))
         return found
 
 
@@ -74,10 +54,11 @@ def build_model(robot: Robot) -> RobotModel:
 
     Links without a joint are merged into the link that carries them: fewer links, the same poses.
     """
-    body = calliope_body(robot)
+    body = body_of_parts(robot)
     carried = {"body": (CHASSIS, np.eye(4))}
     joints: list[str] = []
     links = [CHASSIS]
+    touching = {frozenset(pair) for pair in robot.solid.touching}
     for extra in body.extras:
         joints.append(_extra_joint(extra))
         links.append(extra.name)
@@ -90,6 +71,7 @@ def build_model(robot: Robot) -> RobotModel:
             carried[name] = (name, np.eye(4))
             joints.append(_servo_joint(robot, link, carrier, place @ turn_z(link.offset_rad)))
             links.append(name)
+            touching.add(frozenset((carrier, name)))
     solid: dict[str, list[tuple[FloatArray, Part]]] = {name: [] for name in links}
     for name, parts in body.parts.items():
         carrier, offset = carried.get(name, (name, np.eye(4)))
@@ -100,7 +82,7 @@ def build_model(robot: Robot) -> RobotModel:
         + joints
         + ["</robot>", ""]
     )
-    return RobotModel(text, tuple(links), body, carried)
+    return RobotModel(text, tuple(links), body, carried, frozenset(touching))
 
 
 def write_urdf(model: RobotModel, folder: Path) -> Path:
@@ -128,19 +110,19 @@ def _link_xml(name: str, placed: list[tuple[FloatArray, Part]]) -> str:
     lines = [f'  <link name="{name}">', *_inertial_xml(placed)]
     for offset, part in placed:
         if part.solid:
-            lines += ["    <collision>", f"      {_origin_xml(offset @ part.pose())}", "      <geometry>"]
+            lines += ["    <collision>", f"      {_origin_xml(offset @ pose_of(part))}", "      <geometry>"]
             lines += [f"        {_geometry_xml(part)}", "      </geometry>", "    </collision>"]
     return "\n".join([*lines, "  </link>"])
 
 
 def _inertial_xml(placed: list[tuple[FloatArray, Part]]) -> list[str]:
     mass = sum(part.mass_kg for _, part in placed)
-    centres = [(offset @ part.pose())[:3, 3] for offset, part in placed]
+    centres = [(offset @ pose_of(part))[:3, 3] for offset, part in placed]
     centre = sum((part.mass_kg * c for c, (_, part) in zip(centres, placed, strict=True)), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for at, (offset, part) in zip(centres, placed, strict=True):
         turn, arm = offset[:3, :3], at - centre
-        inertia += turn @ part.inertia() @ turn.T
+        inertia += turn @ inertia_of(part) @ turn.T
         inertia += part.mass_kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     place = np.eye(4)
     place[:3, 3] = centre

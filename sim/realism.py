@@ -87,10 +87,6 @@ LOOSENING_DEG_PER_MIN = 0.03
 BEND_RAD = 0.15
 """Angle of a bent forearm: 3 cm at the marker, which is 0.2 m from the elbow."""
 
-ARM_LINKS = ("arm_base", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
-LOOSE_JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
-OFFSET_LINKS = ("neck_pan", "neck_tilt", *ARM_LINKS)
-
 
 @dataclass(frozen=True)
 class Wear:
@@ -105,7 +101,7 @@ class Wear:
 
     def slip_rad(self, joint: str, time_s: float) -> float:
         """The angle, rad, by which a joint exceeds its servo's shaft."""
-        bent = self.bend_s is not None and time_s >= self.bend_s and joint == "elbow"
+        bent = self.bend_s is not None and time_s >= self.bend_s and joint == self.robot.arm.bend
         return self.slip_radps.get(joint, 0.0) * time_s + (BEND_RAD if bent else 0.0)
 
 
@@ -115,23 +111,26 @@ def body_of(robot: Robot, kind: BodyKind, seed: int, bend_s: float | None = None
         return Wear(robot, bend_s=bend_s)
     rng = stream(seed, "loosening")
     limit = radians(LOOSENING_DEG_PER_MIN) / 60.0
-    slips = {joint: float(rate) for joint, rate in zip(LOOSE_JOINTS, rng.uniform(-limit, limit, 4), strict=True)}
+    loose = robot.arm.joints
+    slips = {joint: float(rate) for joint, rate in zip(loose, rng.uniform(-limit, limit, len(loose)), strict=True)}
     return Wear(_worn(robot, stream(seed, "wear")), slips, bend_s)
 
 
 def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     data = robot.to_data()
     rows = {row["name"]: row for row in data["link"]}
-    for name in ARM_LINKS:
+    arm_links = [robot.link_of(joint) for joint in (*robot.arm.joints, robot.arm.roll)]
+    head_links = [robot.link_of(joint) for joint in (robot.head.pan, robot.head.tilt)]
+    for name in arm_links:
         for length in ("d_m", "r_m"):
             if rows[name][length] != 0.0:
                 rows[name][length] += float(rng.uniform(-LENGTH_M, LENGTH_M))
-    for name in OFFSET_LINKS:
+    for name in head_links + arm_links:
         rows[name]["offset_deg"] += float(rng.uniform(-ZERO_DEG, ZERO_DEG))
     shift_m = _direction(rng) * rng.uniform(0.0, CAMERA_M)
     turn_rad = _direction(rng) * radians(rng.uniform(0.0, CAMERA_DEG))
-    camera = rows["camera"]
-    data["link"] = [row for row in data["link"] if row["name"] != "camera"]
+    camera = rows[robot.kinect.link]
+    data["link"] = [row for row in data["link"] if row is not camera]
     for row in _displacement("camera_mount_worn", camera["parent"], shift_m, turn_rad):
         data["link"].append(row)
         camera["parent"] = row["name"]

@@ -23,7 +23,7 @@ class Trace:
     """Feed it every truth, planner status and task state. `robot` is the description of the true body."""
 
     def __init__(self, robot: Robot, target: str) -> None:
-        self._hand = robot.chain("pad_centre")
+        self._hand = robot.chain(robot.arm.tip)
         self._target = target
         self._began_ns: int | None = None
         self._rows: list[dict[str, Any]] = []

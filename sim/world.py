@@ -103,6 +103,7 @@ class World:
         self._stage = Stage(self._bullet, scene)
         self._wear = wear if wear is not None else Wear(robot)
         self._model = build_model(self._wear.robot)
+        self._jaws = frozenset(robot.link_of(jaw) for jaw in robot.jaws)
         angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
         self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
         self._names = {body: name for name, body in self._stage.bodies.items()}
@@ -240,6 +241,7 @@ class World:
             collisions=collisions(
                 pairs,
                 frozenset(self._model.links),
+                self._jaws,
                 frozenset(self._stage.labels[: self._stage.object_count]),
             ),
         )
@@ -265,7 +267,7 @@ class World:
     def view(self) -> tuple[FloatArray, FloatArray]:
         """`visual_poses` and `camera_pose` now: the links' poses, of which both are made, are computed once."""
         links = self._mechanism.link_poses()
-        return self._visual_poses(links), self._link_pose(links, "camera")
+        return self._visual_poses(links), self._link_pose(links, self.robot.kinect.link)
 
     def visual_poses(self) -> FloatArray:
         """World poses of `visuals` now, in their order, (n, 4, 4)."""
@@ -273,7 +275,7 @@ class World:
 
     def camera_pose(self) -> FloatArray:
         """World pose of the camera, (4, 4); its frame is x right, y down, z forward."""
-        return self.link_pose("camera")
+        return self.link_pose(self.robot.kinect.link)
 
     def link_pose(self, link: str) -> FloatArray:
         """World pose of a link of the robot description, (4, 4)."""

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.description import Part
 from cocoro.robot import Robot
-from sim.body import Part, calliope_body
+from sim.body import body_of_parts, pose_of
 
 LINKS = ("shoulder", "elbow", "wrist_pitch", "wrist_roll", "claw_left", "claw_right")
 STEP_M = 0.006
@@ -16,7 +17,7 @@ STEP_M = 0.006
 
 class ArmShape:
     def __init__(self, robot: Robot) -> None:
-        parts = calliope_body(robot).parts
+        parts = body_of_parts(robot).parts
         self._points = {link: np.vstack([_surface(part) for part in parts[link] if part.solid]) for link in LINKS}
         self._chains = {link: robot.chain(link) for link in LINKS}
         self._low, self._high = np.array(robot.kinect.mount_min_m), np.array(robot.kinect.mount_max_m)
@@ -47,7 +48,7 @@ def _surface(part: Part) -> FloatArray:
         points = _cylinder(*part.size_m)
     else:
         points = _cylinder(part.size_m[0], 2 * part.size_m[0])
-    pose = part.pose()
+    pose = pose_of(part)
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 

@@ -15,6 +15,7 @@ from sim.judge import Judge, PursuitJudge
 from sim.scene import Scene, SceneObject
 
 HZ = 30
+ROBOT = Robot.load()
 BOTH = ("claw_left", "claw_right")
 SCENE = Scene(
     name="test",
@@ -77,7 +78,7 @@ def hold(judge: Judge, start_s: float, lasting_s: float, height_m: float, touchi
 
 
 def test_a_can_in_both_claws_ten_centimetres_up_for_two_seconds_is_held() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     judge.feed(truth(1.0, touching=("floor", *BOTH)))
     hold(judge, 2.0, 1.9, height_m=0.15)
@@ -100,14 +101,14 @@ def test_a_can_in_both_claws_ten_centimetres_up_for_two_seconds_is_held() -> Non
     ],
 )
 def test_too_low_in_one_claw_or_leaning_on_something_is_not_held(height_m: float, touching: tuple[str, ...]) -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     hold(judge, 1.0, 5.0, height_m, touching)
     assert not judge.result().held
 
 
 def test_one_slip_starts_the_two_seconds_anew() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     hold(judge, 1.0, 5.0, height_m=0.15)
     hold(judge, 6.1, 0.0, height_m=0.15, touching=("claw_left",))
@@ -116,7 +117,7 @@ def test_one_slip_starts_the_two_seconds_anew() -> None:
 
 
 def test_a_tilted_can_hangs_lower_than_its_centre_says() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     for tick in range(3 * HZ):
         judge.feed(truth(1.0 + tick / HZ, {"red_can": (0.4, 0.0, 0.155)}, BOTH, {"red_can": 30.0}))
@@ -127,7 +128,7 @@ def test_a_tilted_can_hangs_lower_than_its_centre_says() -> None:
 
 
 def test_a_can_that_tilts_or_moves_too_far_is_knocked_over() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     judge.feed(truth(1.0, {"green_can": (1.0, 1.049, 0.06)}, tilt_deg={"green_can": 29.0}))
     assert judge.result().knocked_over == ()
@@ -140,7 +141,7 @@ def test_a_can_that_tilts_or_moves_too_far_is_knocked_over() -> None:
 
 
 def test_what_the_hand_does_with_the_target_is_no_knocking_over() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     judge.feed(truth(1.0, {"red_can": (1.01, 0.0, 0.06)}))
     judge.feed(truth(2.0, {"red_can": (1.01, 0.0, 0.06)}, (*BOTH, "floor")))
@@ -151,7 +152,7 @@ def test_what_the_hand_does_with_the_target_is_no_knocking_over() -> None:
 
 
 def test_a_ball_does_not_tilt_and_what_moves_by_itself_is_not_knocked_over() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     judge.feed(truth(1.0, {"blue_ball": (2.0, 0.9, 0.5)}, tilt_deg={"yellow_ball": 90.0}))
     assert judge.result().knocked_over == ()
@@ -160,14 +161,14 @@ def test_a_ball_does_not_tilt_and_what_moves_by_itself_is_not_knocked_over() -> 
 
 
 def test_collisions_are_told_once_each_in_the_order_in_which_they_came() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0, collisions=("elbow~green_can",)))
     judge.feed(truth(1.0, collisions=("chassis~red_can", "elbow~green_can")))
     assert judge.result().collisions == ("elbow~green_can", "chassis~red_can")
 
 
 def test_a_task_without_a_target_is_judged_by_the_rest() -> None:
-    judge = Judge(SCENE)
+    judge = Judge(ROBOT, SCENE)
     judge.feed(truth(0.0))
     judge.feed(truth(1.0, {"red_can": (1.2, 0.0, 0.06)}))
     verdict = judge.result()
@@ -176,7 +177,7 @@ def test_a_task_without_a_target_is_judged_by_the_rest() -> None:
 
 
 def test_a_verdict_is_json() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     assert set(msgspec.json.decode(msgspec.json.encode(judge.result()))) == {
         "lifted_m",
@@ -190,7 +191,7 @@ def test_a_verdict_is_json() -> None:
 
 
 def test_where_the_target_ends_is_told_from_where_the_robot_began() -> None:
-    judge = Judge(SCENE, "red_can")
+    judge = Judge(ROBOT, SCENE, "red_can")
     judge.feed(truth(0.0))
     first = judge.result()
     x, y, _ = next(item.position_m for item in truth(0.0).objects if item.label == "red_can")
@@ -200,11 +201,11 @@ def test_where_the_target_ends_is_told_from_where_the_robot_began() -> None:
 
 def test_a_target_that_the_scene_has_not_is_refused() -> None:
     with pytest.raises(KeyError, match="red_can"):
-        Judge(SCENE, "purple_can")
+        Judge(ROBOT, SCENE, "purple_can")
 
 
 def test_what_the_hand_holds_at_the_start_is_not_knocked_over_when_it_is_put_down() -> None:
-    judge = Judge(SCENE)
+    judge = Judge(ROBOT, SCENE)
     judge.feed(truth(0.0, {"red_can": (0.4, -0.1, 0.2)}, touching=BOTH))
     judge.feed(truth(1.0, {"red_can": (0.5, -0.1, 0.06)}))
     assert judge.result().knocked_over == ()

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
-from services.planning.arm import ROLL, ArmController, ArmStep
+from services.planning.arm import ArmController, ArmStep
 from services.planning.clearance import Clearance
 from services.planning.config import PlanningConfig
-from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reach import HandPose, Reacher
 from services.planning.reachability import Reachability
 
 ROBOT = Robot.load()
@@ -28,6 +28,7 @@ SHAPE = ArmShape(ROBOT)
 TICK_S = 0.02
 CLAWS_OPEN = {claw: sign * CONFIG.hand.open_rad for claw, sign in ROBOT.claw.open_sign.items()}
 PARKED = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"] | CLAWS_OPEN
+ARM, ROLL = ROBOT.arm.joints, ROBOT.arm.roll
 LEVEL = {ROLL: ROBOT.claw.level_roll_rad}
 READY = PARKED | LEVEL | {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77}
 

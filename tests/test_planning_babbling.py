@@ -27,13 +27,14 @@ from cocoro.messages import (
     WheelTrial,
 )
 from cocoro.robot import Robot
-from services.planning.arm import ROLL, ArmController
+from services.planning.arm import ArmController
 from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 from services.planning.postures import Postures, sobol
-from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reach import HandPose, Reacher
 
 TICK_NS = NS // 50
+ARM, ROLL = Robot.load().arm.joints, Robot.load().arm.roll
 CONFIG = PlanningConfig()
 
 

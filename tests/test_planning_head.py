@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from cocoro.robot import Robot
 from services.planning.config import HeadConfig
-from services.planning.head import PAN, TILT, Gaze, Sweep
+from services.planning.head import Gaze, Sweep
 
 ROBOT = Robot.load()
 CONFIG = HeadConfig()
 GAZE = Gaze(ROBOT, CONFIG)
+PAN, TILT = ROBOT.head.pan, ROBOT.head.tilt
 CAMERA = ROBOT.chain("camera")
 
 

@@ -21,11 +21,11 @@ from services.executive.tasks import GoToTask, TouchTask
 from services.planning.behaviours.base import Actuators
 from services.planning.config import PlanningConfig
 from services.planning.learned import Learned
-from services.planning.reach import ARM
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import LUMP, Teacher
 
+ARM = Robot.load().arm.joints
 LEVEL_ROLL_RAD = Robot.load().claw.level_roll_rad
 QUICK: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 

@@ -188,6 +188,34 @@ def test_a_hull_or_mount_that_cannot_be_is_refused(tmp_path: Path, text: str, na
         Robot.load(override=written(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('[arm]\ntip = "nowhere"\n', r"own\.toml: arm\.tip: there is no link 'nowhere'"),
+        ('[kinect]\nlink = "nowhere"\n', "kinect.link: there is no link 'nowhere'"),
+        ('[arm]\nroll = "knuckle"\n', "arm: there is no joint 'knuckle'"),
+        ('[head]\npan = "knuckle"\n', "head: there is no joint 'knuckle'"),
+        ('[arm]\nbend = "neck_tilt"\n', "arm: bend = 'neck_tilt' is none of its joints arm_base, shoulder"),
+        ('[[link]]\nname = "elbow"\njoint = "shoulder"\n', "arm: the joint 'elbow' moves no link"),
+        ('[arm]\njoints = ["arm_base"]\n', "arm.joints"),
+        ("[pose.spread]\nknuckle = 1.0\n", "pose spread: there is no joint 'knuckle'"),
+        ('[solid]\ntouching = [["riser", "nowhere"]]\n', "solid.touching: there is no link 'nowhere'"),
+        ('[[solid.part]]\nname = "palm"\nlink = "nowhere"\n', "part palm: there is no link 'nowhere'"),
+        ('[[solid.part]]\nname = "palm"\nsize_m = [0.1]\n', "part palm: size_m of a box is 3 lengths"),
+    ],
+)
+def test_what_the_names_stand_for_must_be_there(tmp_path: Path, text: str, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        Robot.load(override=written(tmp_path, text))
+
+
+def test_a_pose_that_an_arm_needs_names_each_of_its_joints() -> None:
+    data = ROBOT.to_data()
+    del data["pose"]["upright"]["elbow"]
+    with pytest.raises(ConfigError, match="pose upright: the angle of 'elbow' is missing"):
+        Robot.from_data(data)
+
+
 def test_the_two_networks_have_deadmen_of_their_own(tmp_path: Path) -> None:
     robot = Robot.load(override=written(tmp_path, "[network.hand]\ncommand_timeout_s = 0.5\n"))
     assert {name: row.command_timeout_s for name, row in robot.networks.items()} == {"arm": 0.15, "hand": 0.5}

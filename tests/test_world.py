@@ -177,7 +177,7 @@ def test_what_is_near_is_touched_only_when_it_presses() -> None:
 def test_the_bump_reflex_stops_before_a_can_is_knocked_over_and_behind_there_is_none() -> None:
     for x_m, speed_mps, knocked in ((0.6, 0.3, ()), (-0.6, -0.3, ("red_can",))):
         scene = scene_with(can(x_m, 0.0))
-        judge = Judge(scene, "red_can")
+        judge = Judge(ROBOT, scene, "red_can")
         with World(ROBOT, scene) as world:
             Operator(world, judge).run(3.0, wheels_mps=(speed_mps, speed_mps))
             assert judge.result().knocked_over == knocked

@@ -36,7 +36,7 @@ def test_a_can_is_held_by_friction_alone(
     sensors: str, offset_m: tuple[float, float], pitch_deg: float, mass_kg: float
 ) -> None:
     scene = scene_with(can(0.58 + offset_m[0], -0.10 + offset_m[1], mass_kg))
-    judge = Judge(scene, "red_can")
+    judge = Judge(ROBOT, scene, "red_can")
     with World(ROBOT, scene, seed=3, sensors=sensors) as world:  # type: ignore[arg-type]
         operator = grasp_and_lift(world, (0.58, -0.10), radians(pitch_deg), judge)
         verdict = judge.result()
@@ -52,7 +52,7 @@ def test_a_can_is_held_by_friction_alone(
 
 def test_a_held_can_survives_a_shake_and_the_end_of_commands() -> None:
     scene = scene_with(can(0.58, -0.10))
-    judge = Judge(scene, "red_can")
+    judge = Judge(ROBOT, scene, "red_can")
     with World(ROBOT, scene) as world:
         operator = grasp_and_lift(world, (0.58, -0.10), radians(-5.0), judge)
         hand = np.linalg.inv(world.link_pose("pad_centre"))
@@ -74,7 +74,7 @@ def test_a_held_can_survives_a_shake_and_the_end_of_commands() -> None:
 def test_a_ball_is_held_too() -> None:
     ball = SceneObject(label="yellow_ball", shape="sphere", radius_m=0.03, position_m=(0.58, -0.10), mass_kg=0.1)
     scene = scene_with(ball)
-    judge = Judge(scene, "yellow_ball")
+    judge = Judge(ROBOT, scene, "yellow_ball")
     with World(ROBOT, scene, seed=1, sensors="real") as world:
         operator = grasp_and_lift(world, (0.58, -0.10), 0.0, judge, height_m=0.035)
         assert judge.result().held

@@ -157,7 +157,7 @@ class _Rehearsal:
                 self._robot, self._scene, present,
                 distance_m=FollowConfig().distance_m, within_m=WITHIN_M, catch_up_s=CATCH_UP_S,
             )  # fmt: skip
-        return Judge(self._scene, present)
+        return Judge(self._robot, self._scene, present)
 
     def _feed_judge(self, truth: Truth) -> None:
         self._judge.feed(truth)

@@ -9,6 +9,7 @@ one place, however the camera is mounted.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
@@ -28,8 +29,8 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def arm_joints(robot: Robot) -> tuple[str, ...]:
-    """The arm's servos that move the marker: all joints on its chain except the wrist roll."""
-    return tuple(name for name in robot.chain(robot.marker.link).joints if robot.joints[name].network == "arm")
+    """The arm's joints that move the marker; the hand's roll is none of them."""
+    return tuple(name for name in robot.chain(robot.marker.link).joints if name in robot.arm.joints)
 
 
 def fingerprint_of(robot: Robot) -> str:
@@ -60,10 +61,11 @@ class NominalModel:
     """
 
     def __init__(self, robot: Robot, roll_rad: float | None = None) -> None:
-        """`roll_rad`: the wrist roll; None is the roll at which the claws lie level, which babbling keeps."""
+        """`roll_rad`: the hand's roll; None is the one at which the claws lie level, which babbling keeps."""
         roll_rad = robot.claw.level_roll_rad if roll_rad is None else roll_rad
         self.roll_rad = roll_rad
         self.joints = arm_joints(robot)
+        self._roll = robot.arm.roll
         self.limits_rad = np.array([robot.joints[name].limits_rad for name in self.joints])
         self._chain = robot.chain(robot.marker.link)
         self._marker = np.array([*robot.marker.position_m, 1.0])
@@ -84,6 +86,14 @@ class NominalModel:
             elif row.joint is not None:
                 before = before @ turn_z(self._rest[row.joint] + row.offset_rad)
         self._marker = before @ self._marker
+
+    def posture(self, angles_rad: Mapping[str, float]) -> FloatArray:
+        """The angles (n,) of `joints` among those of all joints by name, rad."""
+        return np.array([angles_rad[name] for name in self.joints])
+
+    def holds_at(self, angles_rad: Mapping[str, float], tolerance_rad: float) -> bool:
+        """Whether the hand is rolled as this model takes it to be. `angles_rad`: of all joints, by name."""
+        return abs(angles_rad[self._roll] - self.roll_rad) <= tolerance_rad
 
     def predict(self, angles_rad: FloatArray) -> FloatArray:
         """Marker positions (b, 3) for postures (b, n)."""

@@ -185,11 +185,8 @@ class Cockpit:
             "limits": {
                 "speed_mps": speed_mps,
                 "turn_radps": round(2 * speed_mps / robot.base.wheel_separation_m, 3),
-                **{
-                    f"{joint}_radps": row.max_speed_radps
-                    for joint, row in robot.joints.items()
-                    if joint in robot.chain("camera").joints
-                },
+                "pan_radps": robot.joints[robot.head.pan].max_speed_radps,
+                "tilt_radps": robot.joints[robot.head.tilt].max_speed_radps,
             },
             "fps": self.config.fps,
         }

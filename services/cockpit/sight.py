@@ -70,7 +70,7 @@ class Sight:
 
     def __init__(self, robot: Robot) -> None:
         self._camera = robot.camera
-        self._chain = robot.chain("camera")
+        self._chain = robot.camera_chain
         self._head = History(len(self._chain.joints))
         self._body = History(3, angular=(2,))
 

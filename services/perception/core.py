@@ -158,7 +158,7 @@ class PerceptionCore:
             frame_incarnation=pending.frame_incarnation,
             width=pending.camera.width,
             height=pending.camera.height,
-            pan_rad=head.get("neck_pan"),
-            tilt_rad=head.get("neck_tilt"),
+            pan_rad=head.get(self._robot.head.pan),
+            tilt_rad=head.get(self._robot.head.tilt),
             detections=tuple(self._localiser.locate(pending.sightings, pending.camera, angles)),
         )

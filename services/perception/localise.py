@@ -36,7 +36,7 @@ class Localiser:
         self._catalogue = catalogue
         self._shapes = Shapes(catalogue.objects)
         self._numbers = {label: number for number, label in enumerate(catalogue.labels)}
-        self._chain = robot.chain("camera")
+        self._chain = robot.camera_chain
         self._occluded_share = occluded_share
         self.joints = self._chain.joints
         """The head's joints, in the order of the angles for `camera_pose`."""

@@ -16,15 +16,11 @@ from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig
-from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reach import HandPose, Reacher
 
-ROLL = "wrist_roll"
-OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
-"""Unfolded: the hand points away from the arm base, level, 0.2 m up and 0.36 m out."""
 _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
-_FRONT_RAD = -0.087
 _SLOWEST_RADPS = 0.02
 """Of a joint that moves: 0 would hold it."""
 _ASTRAY_RAD = 0.6
@@ -32,7 +28,7 @@ _ASTRAY_RAD = 0.6
 
 
 class ArmStep(NamedTuple):
-    """Goals for the arm's joints (order of ARM) and the wrist roll, with speeds."""
+    """Goals for the arm's joints (in their order) and for the hand's roll, with speeds."""
 
     goal_rad: FloatArray
     speed_radps: FloatArray
@@ -48,8 +44,14 @@ class ArmController:
         self._config = config
         self._reacher = reacher
         self.clearance = Clearance(robot)
+        self._names, self._roll, self._azimuth = robot.arm.joints, robot.arm.roll, robot.arm.azimuth
         self._roll_rad = robot.claw.level_roll_rad
-        self._park = {name: robot.poses["park"][name] for name in ARM}
+        self._park = {name: robot.poses["park"][name] for name in self._names}
+        upright, self._bend = robot.poses["upright"], robot.arm.bend
+        self._front_rad = upright[self._azimuth]
+        self._bend_sign = float(np.sign(upright[self._bend]))
+        self._out = {name: robot.poses["unfolded"][name] for name in self._names[1:]}
+        """Unfolded in the plane that the arm is in: the hand points away from the arm's foot, level."""
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
         self._lagged_s = 0.0
@@ -57,11 +59,11 @@ class ArmController:
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
         """Clearance of the reference, if it is known."""
-        self._measured: FloatArray = np.zeros(len(ARM))
+        self._measured: FloatArray = np.zeros(len(robot.arm.joints))
 
     @property
     def reference(self) -> dict[str, float] | None:
-        """The commanded angles of ARM and the wrist roll, rad; None before the first measurement."""
+        """The commanded angles of the arm's joints and the hand's roll, rad; None before the first measurement."""
         return self._reference
 
     def resync(self) -> None:
@@ -77,15 +79,15 @@ class ArmController:
 
     def folded(self, angles: Mapping[str, float]) -> bool:
         """Whether the arm is in or near the plane that it parks in."""
-        return angles["arm_base"] > _SIDE_RAD
+        return angles[self._azimuth] > _SIDE_RAD
 
     def parked(self, angles: Mapping[str, float]) -> bool:
-        return all(abs(angles[name] - self._park[name]) < 0.08 for name in ARM)
+        return all(abs(angles[name] - self._park[name]) < 0.08 for name in self._names)
 
     def hold(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         reference = self._sync(measured, dt_s)
-        goal = np.array([reference[name] for name in ARM])
-        return ArmStep(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
+        goal = np.array([reference[name] for name in self._names])
+        return ArmStep(goal, np.full(len(goal), 0.5), reference[self._roll], 0.0, True)
 
     def park(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         """One step of folding the arm beside the camera mount."""
@@ -93,7 +95,7 @@ class ArmController:
         if not self.folded(reference):
             pose = self._reacher.pose(reference)
             astray = self._is_astray(reference, pose)
-            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in OUT.items())
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in self._out.items())
             if not out and pose.height_m < 0.15 and not astray:
                 rise = HandPose(
                     max(pose.radius_m, self._config.travel_radius_m),
@@ -102,13 +104,13 @@ class ArmController:
                     pose.pitch_rad,
                 )
                 return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
-            if not out or abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
-                return self._joints(OUT | {ROLL: self._roll_rad}, dt_s)._replace(arrived=False)
-            return self._joints(OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+            if not out or abs(reference[self._roll] - self._roll_rad) > _NEAR_RAD:
+                return self._joints(self._out | {self._roll: self._roll_rad}, dt_s)._replace(arrived=False)
+            return self._joints(self._out | {self._azimuth: self._park[self._azimuth]}, dt_s)._replace(arrived=False)
         self._astray = False
-        if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
-            return self._joints(OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
-        return self._joints(self._park | {ROLL: 0.0}, dt_s)
+        if abs(reference[self._azimuth] - self._park[self._azimuth]) > _NEAR_RAD:
+            return self._joints(self._out | {self._azimuth: self._park[self._azimuth]}, dt_s)._replace(arrived=False)
+        return self._joints(self._park | {self._roll: 0.0}, dt_s)
 
     def reach(
         self,
@@ -125,21 +127,21 @@ class ArmController:
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
-            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in OUT.items())
-            in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in self._out.items())
+            in_park_plane = reference[self._azimuth] > self._park[self._azimuth] - 0.2
             if not out and in_park_plane:
-                stage = OUT | {ROLL: self._roll_rad}
+                stage = self._out | {self._roll: self._roll_rad}
             else:
-                stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
-        elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
-            stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
+                stage = self._out | {self._azimuth: self._front_rad, self._roll: self._roll_rad}
+        elif reference[self._azimuth] > 0.35 and goal.azimuth_rad < 0.3:
+            stage = self._out | {self._azimuth: self._front_rad, self._roll: self._roll_rad}
         elif self._is_astray(reference, self._reacher.pose(reference)):
-            stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
+            stage = self._out | {self._azimuth: self._front_rad, self._roll: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
             return self._cartesian(goal, speed_mps, dt_s, roll_rad)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
-        return self._joints(stage, dt_s, swing_radps if "arm_base" in stage else None)._replace(
+        return self._joints(stage, dt_s, swing_radps if self._azimuth in stage else None)._replace(
             arrived=False, left=left_m
         )
 
@@ -152,7 +154,8 @@ class ArmController:
         return self._joints(goals, dt_s, speed_radps)
 
     def _is_astray(self, reference: Mapping[str, float], pose: HandPose) -> bool:
-        self._astray |= abs(pose.pitch_rad - self._config.pitch_rad) > _ASTRAY_RAD or reference["elbow"] > _NEAR_RAD
+        bent_back = self._bend_sign * reference[self._bend] < -_NEAR_RAD
+        self._astray |= abs(pose.pitch_rad - self._config.pitch_rad) > _ASTRAY_RAD or bent_back
         return self._astray
 
     @property
@@ -161,20 +164,20 @@ class ArmController:
         return self._stalled_s > self._config.stall_s
 
     def _sync(self, measured: Mapping[str, float], dt_s: float) -> dict[str, float]:
-        names = (*ARM, ROLL)
+        names = (*self._names, self._roll)
         if self._reference is None:
             self._reference = {name: measured[name] for name in names}
         behind = lags = False
         for name in names:
             lead = self._reference[name] - measured[name]
-            lags |= abs(lead) > self._config.wait_rad and name != ROLL
+            lags |= abs(lead) > self._config.wait_rad and name != self._roll
             if abs(lead) > self._config.lead_rad:
                 behind = True
                 self._clearance_m = None
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         self._lagged_s = self._lagged_s + dt_s if lags else 0.0
-        self._measured = np.array([measured[name] for name in ARM])
+        self._measured = np.array([measured[name] for name in self._names])
         return self._reference
 
     @property
@@ -200,13 +203,13 @@ class ArmController:
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
         trial = dict(self._reference)
-        trial.update(zip(ARM, self._reacher.step(self._reference, waypoint).tolist(), strict=True))
+        trial.update(zip(self._names, self._reacher.step(self._reference, waypoint).tolist(), strict=True))
         limit = 2.5 * dt_s
-        for name in ARM:
+        for name in self._names:
             change = trial[name] - self._reference[name]
             trial[name] = self._reference[name] + min(max(change, -limit), limit)
-        roll_gap = (self._roll_rad if roll_rad is None else roll_rad) - self._reference[ROLL]
-        trial[ROLL] += min(max(roll_gap, -limit), limit)
+        roll_gap = (self._roll_rad if roll_rad is None else roll_rad) - self._reference[self._roll]
+        trial[self._roll] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
         return self._commit(trial, left, dt_s, arrived=arrived)
@@ -220,8 +223,8 @@ class ArmController:
         waits = self._waits
         if blocked or waits:
             trial = self._reference
-        goal = np.array([trial[name] for name in ARM])
-        moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
+        goal = np.array([trial[name] for name in self._names])
+        moved = np.abs(goal - np.array([self._reference[name] for name in self._names]))
         # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
         if self._lagged_s > 0.0:  # all joints arrive at once, so that the hand stays on its way
@@ -229,4 +232,4 @@ class ArmController:
             speed = np.maximum(gaps * (speed.max() / gaps.max()), _SLOWEST_RADPS)
         self._reference = trial
         self._clearance_m = before_m if blocked or waits else clearance_m
-        return ArmStep(goal, speed, trial[ROLL], left, arrived and not (blocked or waits), blocked)
+        return ArmStep(goal, speed, trial[self._roll], left, arrived and not (blocked or waits), blocked)

@@ -16,8 +16,6 @@ from cocoro.robot import Robot
 
 ON_CHASSIS_M = 0.03
 """Height of what is mounted on top of the chassis."""
-HAND = "wrist_roll"
-"""The link at which the hand begins."""
 _ALONG_FINGER = np.array([[0.0], [0.5], [1.0]])
 """Places of a finger's balls, as shares of its length."""
 
@@ -39,7 +37,8 @@ class Clearance:
         self._mount_max = np.array(robot.kinect.mount_max_m)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
         self._chassis_top_m = robot.base.chassis_height_m + ON_CHASSIS_M
-        hand = [tube.start == HAND for tube in hull.tube for _ in range(tube.balls)]
+        first = robot.link_of(robot.arm.roll)
+        hand = [tube.start == first for tube in hull.tube for _ in range(tube.balls)]
         self.on_hand: BoolArray = np.array(hand + [True] * (len(self._radii) - len(hand)))
         """Which of the hull's balls belong to the hand, shape (n,)."""
         self._beyond_chassis = hull.tube[0].balls

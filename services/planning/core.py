@@ -21,9 +21,7 @@ from services.planning.arm import ArmStep
 from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
 from services.planning.config import PlanningConfig
 from services.planning.floor_plan import FloorPlanner
-from services.planning.head import PAN, TILT
 from services.planning.learned import Learned
-from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
 NO_COMMAND = "no command"
@@ -256,10 +254,11 @@ class PlanningCore:
         if plan.head is not None:
             self._head_goal = plan.head[:2]
         if self._head_goal is None:
-            self._head_goal = (snapshot.angles[PAN], snapshot.angles[TILT])
+            self._head_goal = snapshot.head_rad
         head_speed = plan.head[2] if plan.head is not None else 1.0
+        robot = self.actuators.robot
         arm = ServoCommand(
-            joints=(PAN, TILT, *ARM),
+            joints=(robot.head.pan, robot.head.tilt, *robot.arm.joints),
             goal_rad=(*self._head_goal, *(float(angle) for angle in step.goal_rad)),
             speed_radps=(head_speed, head_speed, *(float(speed) for speed in step.speed_radps)),
         )

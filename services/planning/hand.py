@@ -6,8 +6,6 @@ from cocoro.messages import ServoCommand, ServoState
 from cocoro.robot import Robot
 from services.planning.config import HandConfig
 
-CLAWS = ("claw_left", "claw_right")
-
 
 class Grip:
     """Commands the claws by their opening angles and detects by their load whether they hold something.
@@ -20,29 +18,31 @@ class Grip:
     def __init__(self, robot: Robot, config: HandConfig) -> None:
         self._config = config
         self._opens = robot.claw.open_sign
+        self._jaws = robot.jaws
+        self._roll = robot.arm.roll
         self._goals: dict[str, float] | None = None
         self._held_since_ns: int | None = None
 
     def open(self) -> None:
-        self._goals = dict.fromkeys(CLAWS, self._config.open_rad)
+        self._goals = dict.fromkeys(self._jaws, self._config.open_rad)
 
     def close(self) -> None:
-        self._goals = dict.fromkeys(CLAWS, -self._config.close_rad)
+        self._goals = dict.fromkeys(self._jaws, -self._config.close_rad)
 
     def clamp(self, hand: ServoState) -> None:
         """Hold the object that has stopped the claws."""
         self._goals = {
-            name: angle - self._config.clamp_rad for name, angle in zip(CLAWS, self.opening(hand), strict=True)
+            name: angle - self._config.clamp_rad for name, angle in zip(self._jaws, self.opening(hand), strict=True)
         }
 
     def halt(self, hand: ServoState) -> None:
         """Stop claws that open or close; those that have met an object clamp it. Claws that clamp already do nothing
         else, so that nothing is dropped."""
         opening, closing = self._config.open_rad, -self._config.close_rad
-        if self._goals == dict.fromkeys(CLAWS, closing) and self._pressed(hand):
+        if self._goals == dict.fromkeys(self._jaws, closing) and self._pressed(hand):
             self.clamp(hand)
-        elif self._goals in (dict.fromkeys(CLAWS, opening), dict.fromkeys(CLAWS, closing)):
-            self._goals = dict(zip(CLAWS, self.opening(hand), strict=True))
+        elif self._goals in (dict.fromkeys(self._jaws, opening), dict.fromkeys(self._jaws, closing)):
+            self._goals = dict(zip(self._jaws, self.opening(hand), strict=True))
 
     def keep(self) -> None:
         """Leave the claws as they are."""
@@ -53,7 +53,7 @@ class Grip:
         goals: list[float] = []
         speeds: list[float] = []
         if roll_rad is not None:
-            joints.append("wrist_roll")
+            joints.append(self._roll)
             goals.append(roll_rad)
             speeds.append(2.5)
         for name, opening in (self._goals or {}).items():
@@ -65,7 +65,7 @@ class Grip:
     def opening(self, hand: ServoState) -> tuple[float, float]:
         """The opening angles of both claws, radians, from the measured positions."""
         place = dict(zip(hand.joints, hand.position_rad, strict=True))
-        left, right = (self._opens[name] * place[name] for name in CLAWS)
+        left, right = (self._opens[name] * place[name] for name in self._jaws)
         return left, right
 
     def opened(self, hand: ServoState) -> bool:
@@ -87,6 +87,6 @@ class Grip:
         """Whether both claws push inwards without closing; they may swing together."""
         loads = dict(zip(hand.joints, hand.load, strict=True))
         speeds = dict(zip(hand.joints, hand.speed_radps, strict=True))
-        pushing = all(-self._opens[name] * loads[name] >= self._config.grip_load for name in CLAWS)
-        closing_radps = -sum(self._opens[name] * speeds[name] for name in CLAWS)
+        pushing = all(-self._opens[name] * loads[name] >= self._config.grip_load for name in self._jaws)
+        closing_radps = -sum(self._opens[name] * speeds[name] for name in self._jaws)
         return pushing and abs(closing_radps) < 0.3

@@ -13,7 +13,6 @@ from cocoro.robot import Robot
 from cocoro.units import Vec3
 from services.planning.config import HeadConfig
 
-PAN, TILT = "neck_pan", "neck_tilt"
 _MOUNT_M = 0.01
 """Margin about the camera's mount."""
 
@@ -22,8 +21,9 @@ class Gaze:
     """Computes the pan and tilt that bring a point into the centre of the image."""
 
     def __init__(self, robot: Robot, config: HeadConfig) -> None:
-        self._chain = robot.chain("camera")
-        self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
+        self._robot = robot
+        self._chain, self._head = robot.camera_chain, robot.head
+        self._limits = [robot.joints[robot.head.pan].limits_rad, config.tilt_range_rad]
         kinect = robot.kinect
         self._half_view = (
             kinect.horizontal_fov_rad / 2 - config.view_margin_rad,
@@ -36,10 +36,10 @@ class Gaze:
         Newton's method from the angles in `start` (derived): the neck's axes are nearly those of the image, so each
         angle is corrected by its own image angle.
         """
-        pan, tilt = start.get(PAN, 0.0), start.get(TILT, 0.0)
+        pan, tilt = start.get(self._head.pan, 0.0), start.get(self._head.tilt, 0.0)
         point = np.array([*point_m, 1.0])
         for _ in range(5):
-            pose = self._chain.pose({PAN: pan, TILT: tilt})
+            pose = self._chain.pose(self._robot.head_angles(pan, tilt))
             x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
             if z < 1e-3:
                 # Behind the camera: first turn by the bearing, with a level camera.
@@ -156,7 +156,7 @@ class CameraTilt:
     def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
         """`tilt_rad`: the angle at the neck by which things are seen higher than they are."""
         self._axis_x_m, _, self._axis_z_m = (
-            robot.chain("neck_tilt").position({"neck_pan": 0.0, "neck_tilt": 0.0}).tolist()
+            robot.chain(robot.link_of(robot.head.tilt)).position(robot.head_angles()).tolist()
         )
         self.tilt_rad = tilt_rad
 
@@ -188,9 +188,10 @@ class CameraTilt:
 def behind_mount(robot: Robot, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
     """Mark the places on the floor, by bearing, rad, and distance, m, each (n,), body frame, that the mount hides from
     a camera that pans to them (slabs, Kay and Kajiya 1986); returns shape (n,)."""
-    kinect, (low, high) = robot.kinect, robot.joints[PAN].limits_rad
+    kinect, (low, high) = robot.kinect, robot.joints[robot.head.pan].limits_rad
     pan = np.clip(bearing_rad, low, high)
-    neck, camera = (robot.chain(link).position({PAN: 0.0, TILT: 0.0}) for link in ("neck_tilt", "camera"))
+    links = robot.link_of(robot.head.tilt), robot.kinect.link
+    neck, camera = (robot.chain(link).position(robot.head_angles()) for link in links)
     ahead_m = camera[0] - neck[0]
     eye = np.stack(
         [neck[0] + ahead_m * np.cos(pan), neck[1] + ahead_m * np.sin(pan), np.full(len(pan), camera[2])], axis=1

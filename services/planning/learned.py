@@ -21,7 +21,6 @@ from services.planning.reach import HandModel
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import Teacher
-from services.planning.teaching import arm_angles as _arm
 
 USUAL_M = 0.005
 """Error of a map whose model has no score."""
@@ -35,7 +34,7 @@ class LearnedHand:
     """
 
     def __init__(self, robot: Robot, learned: HandMap) -> None:
-        self._drawn = robot.chain("pad_centre")
+        self._drawn = robot.chain(robot.arm.tip)
         self._map = learned
 
     def pose(self, angles: Mapping[str, float]) -> FloatArray:
@@ -47,9 +46,9 @@ class LearnedHand:
         return np.asarray(self._drawn.position(angles) + self._offset(angles))
 
     def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
-        """Jacobian (6, 4), as `Chain.jacobian`, for the joints of ARM in their order."""
+        """Jacobian (6, n), as `Chain.jacobian`, for the n joints of the arm in their order."""
         jac = self._drawn.jacobian(angles, joints)
-        at = _arm(angles)
+        at = self._map.nominal.posture(angles)
         if self._map.over_nominal and self._map.coordinates == "cartesian":
             jac[:3] += self._map.network.jacobian(at)
         else:
@@ -57,7 +56,7 @@ class LearnedHand:
         return jac
 
     def _offset(self, angles: Mapping[str, float]) -> FloatArray:
-        at = _arm(angles)
+        at = self._map.nominal.posture(angles)
         if self._map.over_nominal and self._map.coordinates == "cartesian":
             return self._map.network.at(at)
         return np.asarray(self._map.at(at) - self._map.nominal.at(at))
@@ -73,7 +72,7 @@ class SeenHand:
     def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
         self._felt = felt
         self._marker = marker
-        self._roll_rad = (marker.nominal if isinstance(marker, HandMap) else marker).roll_rad
+        self._nominal = marker.nominal if isinstance(marker, HandMap) else marker
         self._config = config
         self._correction = np.zeros(3)
         """Added to the computed hand position, (3,), metres."""
@@ -102,9 +101,9 @@ class SeenHand:
         dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
         self._now_ns = now_ns
         for sighting in sightings:
-            if abs(sighting.angles_rad["wrist_roll"] - self._roll_rad) > config.roll_rad:
+            if not self._nominal.holds_at(sighting.angles_rad, config.roll_rad):
                 continue
-            gap = np.array(sighting.position_m) - self._marker.at(_arm(sighting.angles_rad))
+            gap = np.array(sighting.position_m) - self._marker.at(self._nominal.posture(sighting.angles_rad))
             if float(np.linalg.norm(gap)) <= config.wild_m:
                 self._wanted = gap
                 self._seen_ns = sighting.stamp_ns
@@ -150,7 +149,7 @@ class Learned:
         """Seen less nominal position of the marker, (3,), metres; None where the arm was not learned."""
         if self.map is None:
             return None
-        at = _arm(angles)
+        at = self.map.nominal.posture(angles)
         return np.asarray(self.map.at(at) - self.map.nominal.at(at))
 
     def rest(self) -> None:
@@ -198,6 +197,6 @@ class Learned:
         if learned is not None:
             self.hand = SeenHand(LearnedHand(self._robot, learned), learned, self._config.sight)
         elif self._config.see_hand:
-            self.hand = SeenHand(self._robot.chain("pad_centre"), NominalModel(self._robot), self._config.sight)
+            self.hand = SeenHand(self._robot.chain(self._robot.arm.tip), NominalModel(self._robot), self._config.sight)
         else:
             self.hand = None

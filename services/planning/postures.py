@@ -10,7 +10,6 @@ import scipy  # loads its parts lazily: `scipy.stats` takes half a second
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
-from services.planning.reach import ARM
 
 RANGE_RAD = 2.62
 """The paper's range of each joint."""
@@ -23,18 +22,19 @@ OWN_ARM_M = 0.02
 
 
 class Postures:
-    """Judges postures (4,), rad, in the order of ARM, with the wrist roll level."""
+    """Judges postures (4,), rad, of the arm's joints in their order, with the hand level."""
 
     def __init__(self, robot: Robot) -> None:
-        limits = np.array([robot.joints[name].limits_rad for name in ARM])
+        self._joints, self._roll = robot.arm.joints, robot.arm.roll
+        limits = np.array([robot.joints[name].limits_rad for name in self._joints])
         self.ranges = np.clip(limits, -RANGE_RAD, RANGE_RAD)
         self._clearance = Clearance(robot)
         hull = robot.hull
         self._from_upper_arm_m = hull.tube[0].radius_m + OWN_ARM_M
         self._kinect_min, self._kinect_max = np.array(hull.kinect_min_m), np.array(hull.kinect_max_m)
         self._roll_rad = robot.claw.level_roll_rad
-        self._upper = robot.chain("shoulder"), robot.chain("elbow")
-        self._head = robot.chain("camera").position({"neck_pan": 0.0, "neck_tilt": 0.0})
+        self._upper = robot.chain(hull.tube[0].start), robot.chain(hull.tube[0].end)
+        self._head = robot.camera_chain.position(robot.head_angles())
         self._marker = robot.chain(robot.marker.link), np.array([*robot.marker.position_m, 1.0])
         self._nearest_m = robot.kinect.min_range_m
 
@@ -76,7 +76,7 @@ class Postures:
         return all(self.safe(start + (end - start) * step / count) for step in range(1, count + 1))
 
     def _angles(self, posture: FloatArray) -> dict[str, float]:
-        return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=self._roll_rad)
+        return dict(zip(self._joints, posture.tolist(), strict=True)) | {self._roll: self._roll_rad}
 
 
 def sobol(first: int, ranges: FloatArray) -> Iterator[tuple[int, FloatArray]]:

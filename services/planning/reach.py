@@ -14,8 +14,6 @@ from cocoro.arrays import FloatArray
 from cocoro.frames import wrap_rad
 from cocoro.robot import Robot
 
-ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
-
 
 class HandPose(NamedTuple):
     """Position of the pads' centre and pitch of the hand, about the arm base's vertical axis."""
@@ -58,12 +56,15 @@ class Reacher:
     """Forward and inverse kinematics of the hand, nominal or learned."""
 
     def __init__(self, robot: Robot, damping: float) -> None:
-        self._rigid = robot.chain("pad_centre")
+        self.joints = robot.arm.joints
+        self._rigid = robot.chain(robot.arm.tip)
         self._pad: HandModel = self._rigid
-        self._axis = robot.chain("arm_base").position({"arm_base": 0.0})
-        self._limits = np.array([robot.joints[name].limits_rad for name in ARM])
+        self.azimuth = robot.arm.azimuth
+        self._axis = robot.chain(robot.link_of(self.azimuth)).position({self.azimuth: 0.0})
+        self.upright = robot.poses["upright"] | {robot.arm.roll: robot.claw.level_roll_rad}
+        """Angles, rad, with the hand in front of the robot: the start of iterations, which stay in that family."""
+        self._limits = np.array([robot.joints[name].limits_rad for name in self.joints])
         self._damping = damping * damping * np.eye(4)
-        self.level_roll_rad = robot.claw.level_roll_rad
 
     def use(self, hand: HandModel | None) -> None:
         """Reach with this model; None is the nominal one."""
@@ -94,12 +95,12 @@ class Reacher:
         return hypot(x, y), atan2(y, x), point_m[2]
 
     def step(self, angles: Mapping[str, float], pose: HandPose) -> FloatArray:
-        """Joint angles (4,), rad, in the order of ARM, one step nearer to a hand pose.
+        """Angles (4,), rad, of the arm's joints in their order, one step nearer to a hand pose.
 
         A joint that a step would carry over its limit is put on the limit and the others are solved again.
         """
         transform = self._pad.pose(angles)
-        jac6 = self._pad.jacobian(angles, ARM)
+        jac6 = self._pad.jacobian(angles, self.joints)
         along = transform[:3, 2]
         level = max(float(np.sqrt(max(1.0 - along[2] ** 2, 0.0))), 0.1)
         pitch_row = (jac6[3] * along[1] - jac6[4] * along[0]) / level  # how its axis, turned by a joint, rises
@@ -108,7 +109,7 @@ class Reacher:
         error[:3] = self.point(pose) - transform[:3, 3]
         # A radian of pitch weighs as much as 0.2 m of position.
         error[3] = 0.2 * (pose.pitch_rad - asin(min(max(float(along[2]), -1.0), 1.0)))
-        start = np.array([angles[name] for name in ARM])
+        start = np.array([angles[name] for name in self.joints])
         free = np.ones(4, dtype=bool)
         change = np.zeros(4)
         for _ in range(4):
@@ -127,11 +128,11 @@ class Reacher:
         """Joint angles, rad, for a hand pose, iterated from `angles`; None if it is out of reach (5 mm, 3 degrees)."""
         trial = dict(angles)
         for _ in range(60):
-            trial.update(zip(ARM, self.step(trial, pose).tolist(), strict=True))
+            trial.update(zip(self.joints, self.step(trial, pose).tolist(), strict=True))
             have = self.pose(trial)
             off_m = float(np.linalg.norm(self.point(have) - self.point(pose)))
             if off_m < 0.002 and abs(have.pitch_rad - pose.pitch_rad) < 0.02:
-                return {name: trial[name] for name in ARM}
+                return {name: trial[name] for name in self.joints}
         if off_m < 0.005 and abs(have.pitch_rad - pose.pitch_rad) < 0.05:
-            return {name: trial[name] for name in ARM}
+            return {name: trial[name] for name in self.joints}
         return None

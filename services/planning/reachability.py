@@ -20,7 +20,7 @@ from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.learning.handmap import HandMap
 from cocoro.units import Vec3
 from services.planning.config import ArmConfig
-from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reach import HandPose, Reacher
 
 GAP_FACTOR = 3.0
 """Largest radius of a small ball, as a multiple of the distance of neighbouring sightings."""
@@ -36,8 +36,6 @@ RETREAT_STEP_M, RETREAT_STEPS = 0.005, 8
 RETREAT_ROOM_M = 0.01
 """The arm must be able to fold in further than where it waits, so that it does not wait at its limits."""
 RETREAT_HEIGHTS_M = (0.045, 0.08)
-_UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77}
-"""Elbow up, hand in front of the robot: start of the iteration for joint angles, which stays in that family."""
 
 
 class ReachVerdict(IntEnum):
@@ -170,7 +168,7 @@ class Reachability:
     def __init__(self, config: ArmConfig, reacher: Reacher) -> None:
         self._config = config
         self._reacher = reacher
-        self._upright = _UPRIGHT | {"wrist_roll": reacher.level_roll_rad}
+        self._upright = reacher.upright
         self._seen: tuple[HandMap, ReachMesh] | None = None
         self._retreat_m: float | None = None
 
@@ -220,14 +218,15 @@ class Reachability:
         if height > config.grasp_height_range_m[1]:
             return f"it is {height:.2f} m high, reachable is up to {config.grasp_height_range_m[1]:.2f}"
         grasp = self.grasp(target_m)
-        start = self._upright | {"arm_base": _UPRIGHT["arm_base"] + azimuth}
+        turn = self._reacher.azimuth
+        start = self._upright | {turn: self._upright[turn] + azimuth}
         around = self._reacher.solve(start, grasp.around)
         if around is None or self._reacher.solve(start, grasp.behind) is None:
             return "the joint limits do not let the hand there"
         if self._seen is not None:
             learned, mesh = self._seen
             # In gaps between sightings and a little beyond them the nominal model still serves.
-            place = learned.at(np.array([around[name] for name in ARM]))
+            place = learned.at(np.array([around[name] for name in self._reacher.joints]))
             if mesh.verdict(place) is ReachVerdict.OUTSIDE and mesh.nearest_m(place) > BEYOND_M:
                 return "the hand was never seen anywhere near"
         return ""

@@ -43,7 +43,7 @@ class DepthView:
     def __init__(self, robot: Robot, nearest: bytes, angles_rad: Mapping[str, float]) -> None:
         """`nearest`: as in `Obstacles`; `angles_rad`: the joints at its stamp, by name."""
         self._camera = robot.camera.scaled(COLUMNS, ROWS)
-        pose = robot.chain("camera").pose(angles_rad)
+        pose = robot.camera_chain.pose(angles_rad)
         self._turn = pose[:3, :3]
         self._origin = pose[:3, 3] + self._turn @ np.array(robot.kinect.depth_offset_m)
         depth = np.frombuffer(nearest, dtype=np.uint8).reshape(ROWS, COLUMNS) * STEP_M

@@ -24,7 +24,7 @@ from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import Solid, inside
-from services.planning.head import PAN, TILT, CameraTilt
+from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
 from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
@@ -187,7 +187,7 @@ class StateEstimator:
                 turning_radps = self._turning_radps(seen.stamp_ns)
                 correct = self.seen.running or (on_way and self.matching.shift is not None)
                 if correct and turning_radps < _STEADY_RADPS:
-                    self._match(seen, odometry, hull, angles[PAN])
+                    self._match(seen, odometry, hull, angles[self._robot.head.pan])
                 body = self.matching.place(odometry)
                 self.around.floor.enter(seen, body, hull, known, view)
                 self.seen.enter(seen, body, turning_radps, self.matching.doubt_m)
@@ -216,8 +216,9 @@ class StateEstimator:
         pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
         if angles is None or before is None or pose is None or pose_before is None:
             return inf
-        pan = angles[PAN] - before[PAN] + float(pose[2] - pose_before[2])
-        return hypot(pan, angles[TILT] - before[TILT]) * NS / _GLIMPSE_NS
+        head = self._robot.head
+        pan = angles[head.pan] - before[head.pan] + float(pose[2] - pose_before[2])
+        return hypot(pan, angles[head.tilt] - before[head.tilt]) * NS / _GLIMPSE_NS
 
     def _solids(self, stamp_ns: int) -> list[Solid]:
         """The known objects that a frame shows, and where those are that were seen shortly before it."""

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 from cocoro.clock import NS
 from cocoro.messages import Motion
-from services.planning.arm import ROLL, ArmStep
+from services.planning.arm import ArmStep
 from services.planning.caution import limited
 from services.planning.course import Course
-from services.planning.head import PAN, TILT
 from services.planning.reach import HandPose
 
 if TYPE_CHECKING:
@@ -53,7 +52,8 @@ class SteeredHand:
         if self._unfolding:
             return self._unfold(snapshot, fields)
         self.why = "moving the hand"
-        step = self._steer(snapshot, motion, actuators.reacher.pose({**angles, **reference}), reference[ROLL])
+        have, roll_rad = actuators.reacher.pose({**angles, **reference}), reference[actuators.robot.arm.roll]
+        step = self._steer(snapshot, motion, have, roll_rad)
         if step.blocked:
             self._goal = None
             self.why = "the hand cannot go there: the robot or the floor is in its way"
@@ -109,7 +109,7 @@ class SteeredHand:
             _near(_within(height_m, config.height_m, have.height_m), have.height_m, lead_m),
             goal.pitch_rad,
         )
-        low, high = actuators.robot.joints[ROLL].limits_rad
+        low, high = actuators.robot.joints[actuators.robot.arm.roll].limits_rad
         roll = self._roll_rad + limited(motion.roll_radps, config.roll_radps) * dt_s
         self._roll_rad = _near(min(max(roll, low), high), roll_rad, config.head_lead_rad)
         return actuators.arm.reach(
@@ -134,11 +134,11 @@ class SteeredHead:
     ) -> tuple[float, float, float] | None:
         """Pan and tilt, rad, and speed, rad/s; None leaves the head at its goal."""
         actuators, config = snapshot.actuators, snapshot.actuators.config.by_hand
-        here = snapshot.angles[PAN], snapshot.angles[TILT]
+        here = snapshot.head_rad
         if motion.head:
             self._used_ns = snapshot.now_ns
             start = self._goal or here
-            limits = actuators.robot.joints[PAN].limits_rad, actuators.config.head.tilt_range_rad
+            limits = actuators.robot.joints[actuators.robot.head.pan].limits_rad, actuators.config.head.tilt_range_rad
             rates = (limited(rate, config.head_radps) for rate in (motion.pan_radps, motion.tilt_radps))
             wanted = (angle + rate * snapshot.dt_s for angle, rate in zip(start, rates, strict=True))
             pan, tilt = (

@@ -8,7 +8,7 @@ sightings agree on would take as many new ones to change.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.network import LeastSquares
-from services.planning.reach import ARM
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 
@@ -84,7 +83,7 @@ class Teacher:
     def __init__(self, learned: HandMap, usual_m: float, mesh: ReachMesh) -> None:
         self._adapter = Adapter(learned, usual_m)
         self._mesh = mesh
-        self._roll_rad = learned.nominal.roll_rad
+        self._nominal = learned.nominal
         self._places: list[FloatArray] = []
         self._last_ns: int | None = None
 
@@ -101,9 +100,9 @@ class Teacher:
     def step(self, sightings: Iterable[PostureSighting]) -> None:
         for sighting in sightings:
             new = self._last_ns is None or not 0 <= sighting.stamp_ns - self._last_ns < EVERY_NS
-            if new and abs(sighting.angles_rad["wrist_roll"] - self._roll_rad) <= ROLL_RAD:
+            if new and self._nominal.holds_at(sighting.angles_rad, ROLL_RAD):
                 self._last_ns = sighting.stamp_ns
-                self._take(arm_angles(sighting.angles_rad), np.array(sighting.position_m))
+                self._take(self._nominal.posture(sighting.angles_rad), np.array(sighting.position_m))
 
     def _take(self, angles_rad: FloatArray, place_m: FloatArray) -> None:
         if self._adapter.add(angles_rad, place_m) > WILD_M:
@@ -115,8 +114,3 @@ class Teacher:
         if len(self._places) >= LUMP:
             self._mesh.add(np.array(self._places))
             self._places = []
-
-
-def arm_angles(angles_rad: Mapping[str, float]) -> FloatArray:
-    """Angles (4,), rad, in the order of ARM."""
-    return np.array([angles_rad[name] for name in ARM])

@@ -81,7 +81,6 @@ class RecordingWriter:
 
 
 RATE_HZ = 30
-HEAD = ("neck_pan", "neck_tilt")
 TURN_NS = 3 * NS
 START_NS = NS
 """Time of the first frame; fakenect takes 0 for no time."""
@@ -108,12 +107,12 @@ def record(
 
 
 def _turn_head(world: World, pan_rad: float, tilt_rad: float) -> None:
+    joints = tuple(world.robot.head_angles())
     world.set_latch("released")
     while world.time_ns < TURN_NS:
         if world.time_ns < TURN_NS - NS // 2:  # afterwards it holds, and comes to rest
-            goal = ServoCommand(
-                stamp_ns=world.time_ns, joints=HEAD, goal_rad=(pan_rad, tilt_rad), speed_radps=(1.5, 1.5)
-            )
+            speeds = (1.5, 1.5)
+            goal = ServoCommand(stamp_ns=world.time_ns, joints=joints, goal_rad=(pan_rad, tilt_rad), speed_radps=speeds)
             world.command_servos("arm", goal)
         world.step()
 
@@ -127,7 +126,7 @@ def _truth(world: World) -> dict[str, Any]:
             for one in truth.objects
             if one.kind == "object"
         },
-        "head": {joint: round(truth.joints_rad[joint], 6) for joint in HEAD},
+        "head": {joint: round(truth.joints_rad[joint], 6) for joint in world.robot.head_angles()},
     }
 
 

@@ -15,7 +15,6 @@ from cocoro.messages import BaseState, Frame, ServoState, Truth
 from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
 
-CAMERA = "camera"
 POINTS_PERIOD_NS = NS // 10
 """Least time between two clouds of points. With one for each frame they would be nine tenths of a viewer's file."""
 

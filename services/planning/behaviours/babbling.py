@@ -18,7 +18,7 @@ from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.postures import Postures, sobol
-from services.planning.reach import ARM, HandPose
+from services.planning.reach import HandPose
 
 
 class ArmBabbling:
@@ -65,8 +65,8 @@ class ArmBabbling:
         if self._goal is None:
             step = snapshot.still()
         else:
-            step = arm.towards(dict(zip(ARM, self._goal.tolist(), strict=True)), self.SPEED_RADPS, snapshot.angles,
-                               snapshot.dt_s)  # fmt: skip
+            goal = dict(zip(snapshot.actuators.robot.arm.joints, self._goal.tolist(), strict=True))
+            step = arm.towards(goal, self.SPEED_RADPS, snapshot.angles, snapshot.dt_s)
         head = snapshot.look_at(self._postures.marker_m(snapshot.angles))
         why = f"{self._samples} of {self._count} samples, draw {self._draw}"
         plan = Plan(snapshot.stand(), step, why, head, reports=reports)
@@ -140,7 +140,8 @@ class ArmBabbling:
         found: list[Output] = []
         for sight in snapshot.estimator.sightings_of(snapshot.actuators.config.marker):
             new = self._last_ns is None or sight.stamp_ns - self._last_ns >= self.EVERY_NS
-            level = abs(sight.angles_rad["wrist_roll"] - snapshot.actuators.robot.claw.level_roll_rad) < 0.03
+            robot = snapshot.actuators.robot
+            level = abs(sight.angles_rad[robot.arm.roll] - robot.claw.level_roll_rad) < 0.03
             if new and level and self._samples < self._count:
                 self._last_ns = sight.stamp_ns
                 self._samples += 1

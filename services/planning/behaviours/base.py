@@ -21,7 +21,7 @@ from services.planning.floor_map import FloorMap
 from services.planning.hand import Grip
 from services.planning.head import CameraTilt, Gaze
 from services.planning.navigation import Driver
-from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reach import HandPose, Reacher
 from services.planning.reachability import Reachability
 from services.planning.state_estimator import StateEstimator
 from services.planning.surroundings import Fields, placed, swept_by
@@ -62,7 +62,7 @@ class Actuators:
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
         self.camera_tilt = CameraTilt(robot)
-        self.camera_m = float(robot.chain("camera").pose(dict.fromkeys(robot.joints, 0.0))[2, 3])
+        self.camera_m = float(robot.camera_chain.pose(dict.fromkeys(robot.joints, 0.0))[2, 3])
 
     def _unfolding(self) -> FloatArray:
         arm = ArmController(self.robot, self.config.arm, self.reacher)
@@ -72,7 +72,8 @@ class Actuators:
         hulls = []
         for number in range(500):
             step = arm.reach(goal, travel.hand_speed_mps, angles, 0.02)
-            angles.update(zip(ARM, step.goal_rad.tolist(), strict=True), wrist_roll=step.roll_rad)
+            angles.update(zip(self.robot.arm.joints, step.goal_rad.tolist(), strict=True))
+            angles[self.robot.arm.roll] = step.roll_rad
             if number % 5 == 0:
                 hulls.append(arm.clearance.hull(angles))
             if step.arrived:
@@ -90,6 +91,12 @@ class Snapshot:
     body: Pose2
     angles: Mapping[str, float]
     actuators: Actuators
+
+    @property
+    def head_rad(self) -> tuple[float, float]:
+        """Pan and tilt."""
+        head = self.actuators.robot.head
+        return self.angles[head.pan], self.angles[head.tilt]
 
     def target(self, label: str) -> TargetEstimate | None:
         return self.estimator.memory.estimate(label, self.body, self.now_ns)

@@ -14,7 +14,7 @@ from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
 from services.planning.floor_map import CELL_M
-from services.planning.head import PAN, TILT, Glance, Sweep, glances
+from services.planning.head import Glance, Sweep, glances
 from services.planning.navigation import GENTLE
 from services.planning.seen_floor import Rest, Viewpoint, describe
 
@@ -35,7 +35,7 @@ class Idling:
         if not self._halted and hand is not None:
             self._halted = True
             snapshot.actuators.grip.halt(hand)
-            plan.head = (snapshot.angles[PAN], snapshot.angles[TILT], self.HEAD_RADPS)
+            plan.head = (*snapshot.head_rad, self.HEAD_RADPS)
         return plan
 
 
@@ -123,7 +123,7 @@ class Searching:
 
     def _look(self, snapshot: Snapshot) -> Plan:
         config, seen = snapshot.actuators.config, snapshot.estimator.seen
-        pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
+        pan, tilt = snapshot.head_rad
         lag_s = snapshot.estimator.sight_lag_s
         if not seen.running:  # the first look, or the base restarted with a new odometry frame
             seen.begin(snapshot.body)
@@ -166,8 +166,8 @@ class Searching:
 
     def _pictured(self, snapshot: Snapshot, aim: tuple[float, float]) -> bool:
         """Whether enough pictures were taken since the head rests at an aim (pan, tilt), rad."""
-        estimator, angles = snapshot.estimator, snapshot.angles
-        if abs(aim[0] - angles[PAN]) > 0.05 or abs(aim[1] - angles[TILT]) > 0.05:
+        estimator, (pan, tilt) = snapshot.estimator, snapshot.head_rad
+        if abs(aim[0] - pan) > 0.05 or abs(aim[1] - tilt) > 0.05:
             self._rests_since_ns = None
             return False
         if self._rests_since_ns is None:
@@ -210,7 +210,7 @@ class Searching:
         gone = self._start.inverse().compose(snapshot.body)
         if gone.x_m < -self.BACK_M:
             return None
-        pan = snapshot.angles[PAN]
+        pan, _ = snapshot.head_rad
         speed = -0.10 if abs(pan) < 0.5 else 0.0
         base = snapshot.actuators.driver.command(speed, 1.2 * pan, snapshot.dt_s)
         why = f"{self._label} is too near to be seen in depth: backing away"

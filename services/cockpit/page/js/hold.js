@@ -38,9 +38,9 @@ export class Hold {
     document.addEventListener("stopping", () => this.letGo("stop"));
   }
 
-  /** Take what the robot says it can do at most, by the names of a motion or of a joint of the neck. */
+  /** Take what the robot says it can do at most, by the names of a motion. */
   limit(limits) {
-    for (const name of Object.keys(MOST)) this.limits[name] = Math.min(MOST[name], limits[name] ?? limits[`neck_${name}`] ?? MOST[name]);
+    for (const name of Object.keys(MOST)) this.limits[name] = Math.min(MOST[name], limits[name] ?? MOST[name]);
   }
 
   /** The answer to a motion: the next tick, and whether the motion counted. */
