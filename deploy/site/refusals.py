@@ -7,6 +7,7 @@ beside what it lets pass. `Watch` takes that output over by a pipe, and `Sifter`
 from __future__ import annotations
 
 import fcntl
+import io
 import os
 import re
 import threading
@@ -33,6 +34,8 @@ message: nobody did any of that yet."""
 PIPE_BYTES = 1 << 20
 """zenoh waits where the pipe is full, and with it the robot's messages: it holds some thousand lines, and reading is
 faster than zenoh's writing."""
+READ_BYTES = 64 * 1024
+"""What is read at once, at most."""
 _PAUSE_S = 0.01
 """Between two readings: to wake for each line would cost more than to read it."""
 _KNOWN = 4096
@@ -134,18 +137,34 @@ class Watch:
         self._thread.join(1.0)
 
     def _read(self, fd: int) -> None:
-        rest = b""
         sifter = Sifter()
         with os.fdopen(fd, "rb", buffering=0) as pipe:
-            while part := pipe.read(PIPE_BYTES):
-                whole, _, rest = (rest + part).rpartition(b"\n")
-                rest = rest[:LONGEST_LINE]
+            for lines in whole_lines(pipe):
                 refused: Counter[Refusal] = Counter()
-                for found in sifter.sift(whole):
+                for found in sifter.sift(lines):
                     if isinstance(found, Refusal):
                         refused[found] += 1
                     else:
                         self._told(found)
                 if refused:
                     self._refused(refused)
-                time.sleep(_PAUSE_S)
+
+
+def whole_lines(pipe: io.RawIOBase) -> Iterator[bytes]:
+    """The lines that come out of a pipe, many at once, until its other end is closed. Of a line longer than
+    `LONGEST_LINE` the beginning counts.
+
+    All reads go into one buffer. To have a new one of the pipe's size for each read, as `read` has it, lets the process
+    grow by tens of megabytes in minutes: the C library finds room for it in other places each time."""
+    buffer = bytearray(READ_BYTES)
+    view = memoryview(buffer)
+    kept = 0
+    while got := pipe.readinto(view[kept:]):
+        end = kept + got
+        whole = buffer.rfind(b"\n", 0, end) + 1
+        if whole:
+            yield bytes(view[: whole - 1])
+        kept = min(end - whole, LONGEST_LINE)
+        view[:kept] = view[whole : whole + kept]
+        if end < READ_BYTES:
+            time.sleep(_PAUSE_S)
