@@ -24,3 +24,14 @@ def keep_freed() -> bool:
     except (OSError, AttributeError):  # not glibc
         return False
     return bool(mallopt(_TRIM_THRESHOLD, KEPT_BYTES)) and bool(mallopt(_MMAP_THRESHOLD, OWN_BYTES))
+
+
+def give_back() -> bool:
+    """Gives free memory back to the system, wherever it is in the heap; returns whether the C library can. It takes
+    some milliseconds, in which other threads wait for memory, and what is given back costs its pages anew."""
+    try:
+        malloc_trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError):  # not glibc
+        return False
+    malloc_trim(0)
+    return True

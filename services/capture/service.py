@@ -12,6 +12,7 @@ from pathlib import Path
 from cocoro.capture.folder import RecordingFolder
 from cocoro.clock import NS
 from cocoro.component import Implementation
+from cocoro.heap import give_back
 from cocoro.node import Node
 from services.capture.config import CaptureConfig, folder_of
 from services.capture.keys import KeyFilter, KeyInfo, info_of, lossy
@@ -21,6 +22,10 @@ from services.capture.recorder import Ledger, Recorder
 from services.capture.sink import DirectSink, ThreadedSink
 from services.capture.thinning import ThinningLimits, ThinningWriter
 from services.capture.writer import MB, CaptureWriter, FileLimits, sync_and_close
+
+GIVE_BACK_S = 30.0
+"""What waits for the disk while an occasion begins, or the machine is busy, leaves holes in the heaps of several
+threads. Without giving them back the process grows to the sum of the largest of each."""
 
 
 async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = None) -> None:
@@ -45,6 +50,8 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
     try:
         recorder.start()
         node.ready()
+        if not virtual:
+            node.spawn(_give_back())
         await recorder.report()
     finally:
         recorder.close()
@@ -56,6 +63,12 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
 
 
 implementation = Implementation(CaptureConfig, run)
+
+
+async def _give_back() -> None:
+    while True:
+        await asyncio.sleep(GIVE_BACK_S)
+        await asyncio.to_thread(give_back)
 
 
 def _writer(
