@@ -19,8 +19,8 @@ from cocoro import private
 LOOK_S = 1.0
 """Upper bound for one look at a lock by another process, and for a new holder to write its name, s."""
 _HOLDER_BYTES = 4096
-_PLAIN = re.compile(rb'\{"name":"([a-z0-9_-]*)","pid":([0-9]{1,9})\}')
-"""A holder as nearly all are written; it is read without the module `json`."""
+_PLAIN = rb'\{"name":"([a-z0-9_-]*)","pid":([0-9]{1,9})\}'
+"""A holder as nearly all are written; it is read without the module `json`. Compiled when it is first used."""
 
 
 class Holder(NamedTuple):
@@ -112,7 +112,7 @@ def _written(by: Holder) -> bytes:
 
 def _read(data: bytes) -> Holder:
     """What `_written` made; `UNKNOWN` when it is anything else."""
-    if plain := _PLAIN.fullmatch(data):
+    if plain := re.fullmatch(_PLAIN, data):
         return Holder(plain[1].decode(), int(plain[2]))
     import json
 

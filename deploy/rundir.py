@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from cocoro import private
-from cocoro.bus.register import members
 from cocoro.errors import RefusedError
 from cocoro.held_file import HeldFile, Holder, hold, holder
 from cocoro.private import default_run_dir
@@ -160,7 +159,11 @@ class RunDir:
     @property
     def populated(self) -> bool:
         """Whether a process of this machine is in the robot's mesh."""
-        return self.supervisor() is not None or bool(members(self.path))
+        if self.supervisor() is not None:
+            return True
+        from cocoro.bus.register import members
+
+        return bool(members(self.path))
 
     # --- logs -------------------------------------------------------------------------------------
 

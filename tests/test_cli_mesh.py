@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
+from apps.cli.asked import Asked
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
 from apps.cli.stop_result import StopResult
@@ -231,7 +232,7 @@ def test_the_supervisor_tells_what_the_command_would_find(root: Path) -> None:
             server = survey.SurveyServer(survey.Onlooker(run_dir, bus))
             await server.open()
             found = await survey.Survey(link).take(set(await link.alive()))
-            told = await asyncio.to_thread(status.told_by_supervisor, run_dir)
+            told = await asyncio.to_thread(status.told_by_supervisor, Asked(run_dir.survey_socket))
             assert told is not None
             assert told.keys() == found.keys()
             for known in (told, found):
@@ -243,7 +244,7 @@ def test_the_supervisor_tells_what_the_command_would_find(root: Path) -> None:
                 assert known["base"]["charging"] is False
             server.close()
             assert not run_dir.survey_socket.exists()
-            assert await asyncio.to_thread(status.told_by_supervisor, run_dir) is None
+            assert await asyncio.to_thread(status.told_by_supervisor, Asked(run_dir.survey_socket)) is None
 
     asyncio.run(scenario())
 
@@ -259,7 +260,7 @@ def test_a_supervisor_that_tells_no_report_is_no_answer(root: Path, answer: byte
 
     async def scenario() -> None:
         async with await asyncio.start_unix_server(say, run_dir.survey_socket):
-            assert await asyncio.to_thread(status.told_by_supervisor, run_dir) is None
+            assert await asyncio.to_thread(status.told_by_supervisor, Asked(run_dir.survey_socket)) is None
 
     asyncio.run(scenario())
 

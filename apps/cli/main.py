@@ -85,9 +85,14 @@ def _status(as_json: bool) -> int:
         from cocoro.errors import MeshError
 
         raise MeshError(f"no robot is up on this machine: {START}")
-    from apps.cli.status import show_status, show_told
+    asked = None
+    if len(up) == 1:
+        from apps.cli.asked import Asked
 
-    if len(up) == 1 and (code := show_told(up[0], as_json)) is not None:
+        asked = Asked(up[0].survey_socket)
+    from apps.cli.status import show_status, show_told  # while the supervisor collects what it tells
+
+    if asked is not None and (code := show_told(asked, as_json)) is not None:
         return code
     import asyncio
 

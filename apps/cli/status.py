@@ -7,7 +7,6 @@ the first way imports little.
 
 from __future__ import annotations
 
-import _socket as socket  # the module of that name makes enumerations and takes 2 ms to import
 import json
 from types import SimpleNamespace
 
@@ -22,14 +21,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
+    from apps.cli.asked import Asked
     from apps.client.choice import RobotChoice
-    from deploy.rundir import RunDir
 
 REPLAYED = "replayed"
 """As in `deploy.survey`, which is slow to import; a test compares them."""
-ANSWER_S = 3.5
-"""Longest wait for the supervisor's answer. It waits itself for `deploy.survey.HEALTH_S` where a service is silent."""
-PIECE_BYTES = 65536
 
 COLUMNS = (
     "service", "state", Column("pid", 2, right=True), Column("cpu", right=True), Column("memory", right=True),
@@ -37,26 +33,17 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def show_told(run_dir: RunDir, as_json: bool) -> int | None:
+def show_told(asked: Asked, as_json: bool) -> int | None:
     """Prints the report of the robot's supervisor and returns the exit code; None when it does not answer."""
-    report = told_by_supervisor(run_dir)
+    report = told_by_supervisor(asked)
     return None if report is None else _show(report, as_json)
 
 
-def told_by_supervisor(run_dir: RunDir) -> dict[str, Any] | None:
+def told_by_supervisor(asked: Asked) -> dict[str, Any] | None:
     """The report of the robot's supervisor; None when it does not answer."""
-    pieces = []
     try:
-        line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        try:
-            line.settimeout(ANSWER_S)
-            line.connect(str(run_dir.survey_socket))
-            while piece := line.recv(PIECE_BYTES):
-                pieces.append(piece)
-        finally:
-            line.close()
-        report = json.loads(b"".join(pieces))
-    except (OSError, ValueError):
+        report = json.loads(asked.answer())
+    except ValueError:
         return None
     return report if isinstance(report, dict) else None
 

@@ -33,7 +33,7 @@ LOCK_PATIENCE_S = 0.25
 """Upper bound for the wait for the directory's lock, s. It is held for a few file operations; a holder that takes
 longer has been stopped. Joining then goes on without the lock, since an emergency stop must get through; the price is
 that some pairs are connected twice."""
-_ENTRY = re.compile(rf"([0-9a-f]{{16}}){re.escape(ENTRY)}")
+_ENTRY = rf"([0-9a-f]{{16}}){re.escape(ENTRY)}"
 
 
 class Member(NamedTuple):
@@ -135,7 +135,7 @@ def _living(directory_fd: int, tidy: bool) -> list[Member]:
     """The entries that are held. With `tidy` (under the directory's lock) the entries of dead members are removed."""
     found = []
     for name in sorted(os.listdir(directory_fd)):
-        match = _ENTRY.fullmatch(name)
+        match = re.fullmatch(_ENTRY, name)
         fd = None if match is None else _open_entry(directory_fd, name)
         if match is None or fd is None:
             continue
