@@ -126,6 +126,7 @@ def run(
 async def _main(
     process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str, beat_fd: int | None = None
 ) -> int:
+    from cocoro.bus.session import receive_in_one_thread
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock
     from cocoro.component import load as load_component
@@ -142,6 +143,8 @@ async def _main(
     try:
         with suppress(PermissionError):  # a negative value is a privilege
             os.nice(row.nice)
+        if row.records:
+            receive_in_one_thread()
         component = load_component(row)
         config = profile.config(process, component.config)
         launch = profile.launch(process)

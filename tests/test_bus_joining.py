@@ -142,6 +142,36 @@ async def test_where_nobody_is_the_error_says_what_to_start(directory: Path) -> 
 
 
 @pytest.mark.process
+def test_a_process_that_receives_in_one_thread_receives_all_in_order(directory: Path) -> None:
+    script = """
+from cocoro.bus.session import receive_in_one_thread
+async def main():
+    receive_in_one_thread()
+    got, end = [], asyncio.Event()
+    def take(key, payload):
+        got.append(int(payload))
+        if len(got) == 500:
+            end.set()
+    async with await join(shared_memory=False) as reader, await join(shared_memory=False) as writer:
+        reader.subscribe("robot/count", Qos.EVENT, take, depth=1)
+        publisher = writer.publisher("robot/count", Qos.EVENT)
+        while not got:
+            publisher.put(b"0")
+            await asyncio.sleep(0)
+        for number in range(1, 501):
+            publisher.put(b"%d" % number)
+        await end.wait()
+        threads = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
+        say(got == sorted(got), sum(name.startswith("rx") for name in threads))
+asyncio.run(main())
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", CHILD + script, str(directory), "one"], stdout=subprocess.PIPE, timeout=PATIENCE_S
+    )
+    assert (run.returncode, run.stdout.split()) == (0, [b"True", b"1"])
+
+
+@pytest.mark.process
 @scenario
 async def test_what_dead_processes_left_is_no_mesh(directory: Path) -> None:
     async with child(directory, "base") as base:

@@ -168,6 +168,16 @@ async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = No
     return await future
 
 
+_THREADS, _ONE_RECEIVES = "ZENOH_RUNTIME", "(rx: (worker_threads: 1))"
+"""Environment variable with the threads of zenoh, which it reads when the first session of a process opens."""
+
+
+def receive_in_one_thread() -> None:
+    """Has zenoh receive in one thread of this process, instead of two that wake one another for most messages. For a
+    process that only listens to many small messages; to be called before its first session."""
+    os.environ.setdefault(_THREADS, _ONE_RECEIVES)
+
+
 class ExitGuard:
     """Closes forgotten sessions before the interpreter is finalized, and lets zenoh's threads return from callbacks:
     zenoh must not call back into an interpreter that is being finalized (see `deploy.quit`). Only a program that ends
