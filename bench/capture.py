@@ -64,6 +64,12 @@ NOT_REPLAYED = ("alive", "requests", "recorder", "asker")
 """Tokens of those who live, and what was asked of them."""
 SHARE_PERCENT = 10.0
 """The recorder's share of a core, at most."""
+NOTE = (
+    "The recorder's time with noisy frames, by 8 s of samples on a busy machine: 58% in the writer's thread, two "
+    "thirds of it zstd; 26% in zenoh's threads; 16% in the loop. The colour takes 1.2 of the 1.7 ms that zstd takes "
+    "for such a frame, and 0.2 without entropy coding, at 1.4 times the size. Other tables, matches and windows "
+    "change neither."
+)
 PROFILE = """
 clock = "sim"
 processes = ["capture", "sim", "perception", "planning", "executive"]
@@ -122,6 +128,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
         recorded = folder
         if set(parts) & {"traffic", "reexecute", "again"}:
             both = "traffic" in parts and not chosen.short
+            report.notes.append(NOTE)
             for sensors in [chosen.sensors] if chosen.sensors else ["ideal", "real"] if both else ["real"]:
                 recorded = folder / sensors
                 recorded.mkdir()
