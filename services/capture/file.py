@@ -36,7 +36,7 @@ from mcap.records import (
 from cocoro.about import versions
 from cocoro.capture import mcap
 from cocoro.capture.conventions import CHECKSUM, MAKER, PROFILE, TALLY, KeyTally, checksum, tally_names
-from services.capture.packing import PackedMessage, Packer, Parts, message_head
+from services.capture.packing import PackedMessage, Packer, message_head
 
 LIBRARY = f"{MAKER} {versions().get('cocoro-mesh', '')}".strip()
 LARGE_BYTES = 64 * 1024
@@ -139,9 +139,9 @@ class CaptureFile:
         self._pending.clear()
         self.tallies[packed.channel_id].add(packed.log_ns, packed.payload_bytes)
         head = mcap.ChunkHead(
-            packed.log_ns, packed.log_ns, packed.raw_bytes, packed.crc, packed.compression, packed.size_bytes
+            packed.log_ns, packed.log_ns, packed.raw_bytes, packed.crc, packed.compression, len(packed.data)
         )
-        self._write_chunk(head, packed.parts, {packed.channel_id: [packed.log_ns, packed.message_at]})
+        self._write_chunk(head, packed.data, {packed.channel_id: [packed.log_ns, packed.message_at]})
 
     def _flush_declarations(self) -> None:
         """A message must not come before its channel, which may be in the chunk of small messages."""
@@ -163,7 +163,7 @@ class CaptureFile:
             raw = b"".join(chunk.parts)
             name, packed = self._packer.pack_small(raw)
             head = mcap.ChunkHead(chunk.start_ns, chunk.end_ns, len(raw), mcap.crc32(raw), name, len(packed))
-            self._write_chunk(head, (packed,), chunk.places)
+            self._write_chunk(head, packed, chunk.places)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Write a metadata record, with a checksum where the file has this project's profile; MCAP itself has none for
@@ -209,22 +209,22 @@ class CaptureFile:
 
     # --- writing ----------------------------------------------------------------------------------
 
-    def _write_chunk(self, chunk: mcap.ChunkHead, packed: Parts, index: Mapping[int, list[int]]) -> None:
+    def _write_chunk(self, chunk: mcap.ChunkHead, packed: bytes, index: Mapping[int, list[int]]) -> None:
         head = chunk_head(chunk)
-        length = len(head) + chunk.packed_bytes
+        length = len(head) + len(packed)
         offsets, entries, at = {}, [], self.size_bytes + length
         for channel_id, places in index.items():
             offsets[channel_id] = at
             entries.append(message_index(channel_id, places))
             at += len(entries[-1])
         offset = self.size_bytes
-        self._write([head, *packed, b"".join(entries)])
+        self._write([head, packed, b"".join(entries)])
         self._chunks.append(
             ChunkIndex(
                 chunk_length=length,
                 chunk_start_offset=offset,
                 compression=chunk.compression,
-                compressed_size=chunk.packed_bytes,
+                compressed_size=len(packed),
                 message_end_time=chunk.end_ns,
                 message_index_length=at - offset - length,
                 message_index_offsets=offsets,

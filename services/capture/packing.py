@@ -1,8 +1,7 @@
 """Packs messages as they are in a capture.
 
 A large payload is packed where it is, and its message's head is put before it afterwards (`behind_start`). To join both
-first takes a frame's size in memory, and some more time (`python -m bench capture-format records`). The parts of what
-is packed are joined by the file alone, in the call that writes them.
+first takes a frame's size in memory, and some more time (`python -m bench capture-format records`).
 
 Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python -m bench capture
 frames`): zstd at level 1 makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11
@@ -36,7 +35,6 @@ SMALL_LEVEL = 3
 
 
 _Pack = Callable[[bytes | memoryview], bytes]
-Parts = tuple[bytes | memoryview, ...]
 
 
 class Packer:
@@ -76,24 +74,20 @@ class Packer:
         raw_bytes, crc = len(start) + len(payload), mcap.crc32(payload, mcap.crc32(start))
         return PackedMessage(channel_id, log_ns, len(payload), raw_bytes, crc, *self._pack_behind(start, payload))
 
-    def _pack_behind(self, start: bytes, payload: bytes) -> tuple[str, Parts]:
+    def _pack_behind(self, start: bytes, payload: bytes) -> tuple[str, bytes]:
         """Compress `start` and a large payload as one piece."""
-        if self._pack is None:
-            return "", (start, payload)
         if self._name == "zstd":
             name, packed = self.pack(payload)
             if not name:
-                return name, (start, payload)
-            if parts := behind_start(start, packed):
-                return name, parts
-        name, packed = self.pack(b"".join((start, payload)))
-        return name, (packed,)
+                return name, b"".join((start, payload))
+            if whole := behind_start(start, packed):
+                return name, whole
+        return self.pack(b"".join((start, payload)))
 
     def behind(self, before: Sequence[bytes], packed: PackedMessage) -> PackedMessage:
         """Pack a chunk again with the records `before` in front of it."""
-        raw = b"".join((*before, _unpacked(packed.compression, b"".join(packed.parts))))
-        name, data = self.pack(raw)
-        return PackedMessage(*packed[:3], len(raw), mcap.crc32(raw), name, (data,))
+        raw = b"".join((*before, _unpacked(packed.compression, packed.data)))
+        return PackedMessage(*packed[:3], len(raw), mcap.crc32(raw), *self.pack(raw))
 
 
 class PackedMessage(NamedTuple):
@@ -105,17 +99,7 @@ class PackedMessage(NamedTuple):
     raw_bytes: int
     crc: int
     compression: str
-    parts: Parts
-    """The packed chunk, in pieces that follow one another."""
-
-    @property
-    def size_bytes(self) -> int:
-        return sum(map(len, self.parts))
-
-    def copied(self) -> PackedMessage:
-        """The same with one part, in memory of its own that is as long as it."""
-        parts = self.parts
-        return self._replace(parts=(b"".join(parts) if len(parts) > 1 else bytes(memoryview(parts[0])),))
+    data: bytes
 
     @property
     def message_at(self) -> int:
@@ -130,20 +114,20 @@ _LONGEST_START = 1 << 15
 """Bytes; a block may be as long as the window."""
 
 
-def behind_start(start: bytes, frame: bytes) -> Parts:
+def behind_start(start: bytes, frame: bytes) -> bytes:
     """The zstd frame of `start` and the content of `frame` after it, without packing that again: `start` becomes a
     block that is not compressed (RFC 8878, 3.1.1). Matches are distances back, so those of the later blocks stay right.
 
-    Returns no parts for a frame whose header has another form than zstd writes for large payloads, or a long start.
+    Returns b"" for a frame whose header has another form than zstd writes for large payloads, or a long start.
     """
     header_bytes = _HEADER_BYTES.get(frame[4])
     if header_bytes is None or len(start) > _LONGEST_START:
-        return ()
+        return b""
     size_at = header_bytes - 4
     content_bytes = int.from_bytes(frame[size_at:header_bytes], "little") + len(start)
     block_head = (len(start) << 3).to_bytes(3, "little")  # neither the last block, nor compressed
-    head = b"".join((frame[:size_at], content_bytes.to_bytes(4, "little"), block_head, start))
-    return head, memoryview(frame)[header_bytes:]
+    rest = memoryview(frame)[header_bytes:]
+    return b"".join((frame[:size_at], content_bytes.to_bytes(4, "little"), block_head, start, rest))
 
 
 def _unpacked(compression: str, data: bytes) -> bytes:

@@ -53,7 +53,7 @@ class _Held:
 
     @property
     def size_bytes(self) -> int:
-        return self.message.size_bytes if isinstance(self.message, PackedMessage) else len(self.message.payload)
+        return len(self.message.data if isinstance(self.message, PackedMessage) else self.message.payload)
 
 
 class ThinningWriter(CaptureWriter):

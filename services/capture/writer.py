@@ -149,7 +149,7 @@ class CaptureWriter:
         """
         message, number = self._numbered(message)
         packed = self._packer.message(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
-        return packed.copied()
+        return packed._replace(data=bytes(memoryview(packed.data)))
 
     def put_packed(self, packed: PackedMessage) -> None:
         self._turn(packed.log_ns)
