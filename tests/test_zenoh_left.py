@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from tests.test_zenoh_router import LOCAL, opened
+from zenoh_rig import LOCAL, opened
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
@@ -32,7 +31,7 @@ def in_use_bytes() -> int:
 LEAVERS = """
 import sys
 sys.path[:0] = {path!r}
-from tests.test_zenoh_router import opened
+from zenoh_rig import opened
 for _ in range({count}):
     session = opened("client", [], [{end!r}], {{}})
     subscriber = session.declare_subscriber({keyexpr!r}, print)

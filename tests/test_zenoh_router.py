@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 import zenoh
 from zenoh.handlers import Callback
+from zenoh_rig import LOCAL, opened
 
 from deploy.site import authority, credentials, place
 
 pytestmark = pytest.mark.zenoh
 
-LOCAL = "unixsock-stream"
 EVERYTHING = [
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
@@ -39,24 +39,6 @@ def until(condition: Callable[[], object], what: str) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, what
         time.sleep(0.005)
-
-
-def opened(mode: str, listen: list[str], connect: list[str], more: dict[str, Any]) -> zenoh.Session:
-    options = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
-        "connect/timeout_ms": 2000 if mode == "client" else -1,
-        "scouting/delay": 0,
-        "transport/shared_memory/enabled": False,
-        **more,
-    }
-    config = zenoh.Config()
-    for path, value in options.items():
-        config.insert_json5(path, json.dumps(value))
-    return zenoh.open(config)
 
 
 class Room:
