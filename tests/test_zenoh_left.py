@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from zenoh_rig import LOCAL, opened
+from bare_zenoh import LOCAL, opened
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
@@ -31,7 +31,7 @@ def in_use_bytes() -> int:
 LEAVERS = """
 import sys
 sys.path[:0] = {path!r}
-from zenoh_rig import opened
+from bare_zenoh import opened
 for _ in range({count}):
     session = opened("client", [], [{end!r}], {{}})
     subscriber = session.declare_subscriber({keyexpr!r}, print)

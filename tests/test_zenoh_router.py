@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 import zenoh
+from bare_zenoh import LOCAL, opened
 from zenoh.handlers import Callback
-from zenoh_rig import LOCAL, opened
 
 from deploy.site import authority, credentials, place
 
