@@ -162,7 +162,7 @@ async def _trial(robot: LiveRobot, what: str, sent: Path, rng: random.Random) ->
         robot.node.drop(topics.BASE_COMMAND)
     since = max(row.sim_ns for row in robot.rows if row.real_ns <= last_ns)
     moving = [row for row in robot.rows if row.sim_ns > since and row.moves_mps >= STANDING_MPS]
-    turning = [each.stamp_ns for each in commands if each.left_mps or each.right_mps]
+    turning = [each.stamp_ns for each in commands if each.ahead_mps or each.turn_radps]
     return Trial(
         what, round(speed_mps, 3), (moving[-1].sim_ns - since) / NS if moving else 0.0,
         (moving[-1].real_ns - last_ns) / NS if moving else 0.0, (max(turning, default=since) - since) / NS,

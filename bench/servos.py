@@ -98,7 +98,7 @@ async def measure_base(folder: Path, seconds: float, report: Report) -> None:
         states = other.inbox(topics.BASE_STATE)
         started_s = time.perf_counter()
         async for _ in other.every(50.0):
-            other.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.12))
+            other.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.11, turn_radps=0.08))
             if meter is None and time.perf_counter() - started_s > 1.0:
                 meter = Meter([child for child in psutil.Process().children() if "guard" in " ".join(child.cmdline())])
                 states.add(lambda _key, message, meter=meter: meter.take(message))  # type: ignore[misc]

@@ -88,7 +88,7 @@ async def brain(node: Node, options: dict[str, Any]) -> dict[str, Any]:
     begun_s = time.monotonic()
     number = 0
     while time.monotonic() < (first[0] + SETTLE_S + options["seconds"] if first else begun_s + LONGEST_S):
-        commands.put(BaseCommand(left_mps=0.1, right_mps=0.1))
+        commands.put(BaseCommand(ahead_mps=0.1, turn_radps=0.0))
         number += 1
         await asyncio.sleep(max(0.0, begun_s + number / COMMAND_HZ - time.monotonic()))
     return heard

@@ -105,14 +105,14 @@ async def speak(role: str, options: dict[str, Any]) -> dict[str, list[int]]:
             commands = node.publisher(BASE_COMMAND)
             publishers = [each.declare_publisher(RAW, **QOS[Qos.COMMAND]) for each in raw.values()]
             # As many bytes as the node's message has.
-            size = bytes(len(encode(BaseCommand(left_mps=0.1, right_mps=0.1, stamp_ns=1 << 60, seq=1 << 15))))
+            size = bytes(len(encode(BaseCommand(ahead_mps=0.1, turn_radps=0.0, stamp_ns=1 << 60, seq=1 << 15))))
             await asyncio.sleep(SETTLE_S)
             begun_s = time.monotonic()
             for number in range(WAYS * options["commands"]):  # in turns, a third of a period apart
                 await asyncio.sleep(max(0.0, begun_s + number / (WAYS * HZ) - time.monotonic()))
                 way = number % WAYS
                 if way == len(publishers):
-                    commands.put(BaseCommand(left_mps=0.1, right_mps=0.1))
+                    commands.put(BaseCommand(ahead_mps=0.1, turn_radps=0.0))
                 else:
                     publishers[way].put(stamped(size))
             await asyncio.sleep(SETTLE_S)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import degrees
 
 from cocoro.description import Base
+from cocoro.differential import wheels_of
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import REPORT_PERIOD_S, Odometry, WheelRamp
@@ -66,11 +67,14 @@ class MobileBase:
         """Why the wheels do not turn as commanded; '' when they do."""
 
     def command(self, command: BaseCommand, now_ns: int) -> str:
-        """Accept wheel speeds. They expire `Base.patience_s` after the command's stamp (without a stamp: after now).
+        """Accept speeds. They expire `Base.patience_s` after the command's stamp (without a stamp: after now).
         Returns '' when accepted, otherwise the reason for refusing."""
         if self.latch != "released":
             return STOPPED_BY[self.latch]
-        self._wanted = command.left_mps, command.right_mps
+        try:
+            self._wanted = wheels_of(self._base, command)
+        except ValueError as error:
+            return str(error)
         sent_ns = min(command.stamp_ns or now_ns, now_ns)
         self._valid_until_ns = sent_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
         return ""

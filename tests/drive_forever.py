@@ -20,7 +20,7 @@ async def main(port: str) -> None:
         other.spawn(run(node, BaseConfig(port=port)))
         async for _ in other.every(50.0):
             other.publish(topics.LATCH, Latch(state="released"))
-            other.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2))
+            other.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.2, turn_radps=0.0))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ async def main(name: str) -> None:
         node.ready()
         async for _ in node.every(50.0):
             node.publish(topics.LATCH, Latch(state="released"))
-            node.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2))
+            node.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.2, turn_radps=0.0))
 
 
 if __name__ == "__main__":

@@ -230,9 +230,9 @@ class LiveRobot:
     def obeyed_since(self, when_s: float) -> list[tuple[float, float]]:
         """Later wheel commands other than zero."""
         return [
-            (command.left_mps, command.right_mps)
+            (command.ahead_mps, command.turn_radps)
             for command in self.heard(topics.BASE_COMMAND)
-            if command.stamp_ns > when_s * NS and (command.left_mps or command.right_mps)
+            if command.stamp_ns > when_s * NS and (command.ahead_mps or command.turn_radps)
         ]
 
     def held(self, label: str) -> bool:

@@ -41,7 +41,7 @@ def inbox_of(topic: Topic[Any], clock: StillClock | None = None) -> tuple[Inbox[
 
 def payload(topic: Topic[Any], seq: int = 0, incarnation: int = 1, stamp_ns: int = 100 * NS, **fields: Any) -> bytes:
     goods: dict[str, dict[str, Any]] = {
-        topics.BASE_COMMAND.name: {"left_mps": 0.1, "right_mps": 0.1},
+        topics.BASE_COMMAND.name: {"ahead_mps": 0.1, "turn_radps": 0.1},
         topics.INTENT.name: {"action": {"action": "park"}},
         topics.BASE_STATE.name: {"odometry_m": (0, 0), "odometry_yaw_rad": 0, "speed_mps": 0, "turn_rate_radps": 0},
     }

@@ -137,4 +137,4 @@ def started(config: PlanningConfig | None = None, make: type[PlanningCore] = Pla
 
 def standing(planner: Planner) -> bool:
     """Whether zero is commanded to the wheels, or nothing, which also stops them."""
-    return planner.wheels == BaseCommand(left_mps=0.0, right_mps=0.0) if "base/command" in planner.commanded else True
+    return planner.wheels == BaseCommand(ahead_mps=0.0, turn_radps=0.0) if "base/command" in planner.commanded else True

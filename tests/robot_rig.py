@@ -224,7 +224,7 @@ class RobotRig:
     def commanded_since(self, when_s: float) -> list[tuple[float, float]]:
         """The wheel commands that were published later."""
         return [
-            (command.left_mps, command.right_mps)
+            (command.ahead_mps, command.turn_radps)
             for command in self.tap.messages(topics.BASE_COMMAND)
             if command.stamp_ns > when_s * NS
         ]

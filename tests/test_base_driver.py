@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cocoro.clock import NS
+from cocoro.differential import command_of
 from cocoro.messages import BaseCommand
 from cocoro.odometry import WheelRamp
 from cocoro.robot import Robot
@@ -24,7 +25,7 @@ def released() -> BaseDriver:
 
 
 def command(wheels: tuple[float, float]) -> BaseCommand:
-    return BaseCommand(left_mps=wheels[0], right_mps=wheels[1], stamp_ns=SAID_NS)
+    return command_of(BASE, *wheels, SAID_NS)
 
 
 @pytest.mark.parametrize("wheels", SPEEDS)

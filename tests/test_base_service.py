@@ -18,6 +18,7 @@ from wire_base import DEADMAN_NS, MS, PATIENCE_NS, Bench
 
 from cocoro import topics
 from cocoro.clock import RealClock
+from cocoro.differential import command_of
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseConfig, BaseService
@@ -66,7 +67,7 @@ class Driven:
     async def _drive(self, left_mps: float, right_mps: float) -> None:
         async for _ in self.service.tester.every(50.0):
             self.commanded_ns = time.monotonic_ns()
-            self.service.feed(topics.BASE_COMMAND, BaseCommand(left_mps=left_mps, right_mps=right_mps))
+            self.service.feed(topics.BASE_COMMAND, command_of(self.service.robot.base, left_mps, right_mps))
 
     async def wheels(self, left: int, right: int) -> int:
         return await asyncio.to_thread(self.bench.until_wheels, left, right)
@@ -128,8 +129,8 @@ async def test_an_old_command_is_none(bench: Bench) -> None:
     async with driven(bench) as base:
         base.release()
         stamp_ns = base.service.tester.now_ns() - 300 * MS
-        base.service.feed(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2), stamp_ns)
-        base.service.feed(topics.BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.1))
+        base.service.feed(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.2, turn_radps=0.0), stamp_ns)
+        base.service.feed(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.1, turn_radps=0.0))
         await base.wheels(100, 100)
         await base.wheels(0, 0)
         assert [wheels for _, wheels in bench.create.acted] == [(100, 100), (0, 0)]

@@ -183,8 +183,11 @@ def test_a_damaged_capture_is_mended_as_far_as_it_goes(
     whole: bytes, tmp_path: Path, original: set[Told], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "damaged.mcap"
+    path.write_bytes(whole)
+    with Capture.open(path) as capture:
+        longest = max(capture.places, key=lambda place: place.length)
     damaged = bytearray(whole)
-    middle = len(whole) // 2
+    middle = longest.offset + longest.length // 2
     damaged[middle : middle + 100] = os.urandom(100)
     path.write_bytes(damaged)
     assert main(["capture", "info", "--check", str(path)]) == 1

@@ -17,6 +17,9 @@ from apps.captures.rewrite import info_in
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
+from cocoro.differential import wheels_of
+from cocoro.messages import BaseCommand
+from cocoro.robot import Robot
 from services.capture.keys import QueuedMessage
 from services.capture.packing import Packer
 from services.capture.writer import CaptureWriter, FileLimits
@@ -24,10 +27,17 @@ from services.planning.core import PlanningCore
 
 
 def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = lambda _: None) -> Path:
-    """The golden capture as if the planner's status had no `model` and another field, an object no `sigma_m`, and an
-    intent its action's name and fields beside each other."""
+    """The golden capture as if the planner's status had no `model` and another field, an object no `sigma_m`, an intent
+    its action's name and fields beside each other, and a command of the base the speeds of its wheels."""
+    base = Robot.load().base
 
     def older(name: str, payload: bytes) -> bytes:
+        if name == "BaseCommand":
+            left_mps, right_mps = wheels_of(base, msgspec.msgpack.decode(payload, type=BaseCommand))
+            command = {**msgspec.msgpack.decode(payload), "left_mps": left_mps, "right_mps": right_mps}
+            for field in ("ahead_mps", "turn_radps", "aside_mps"):
+                command.pop(field, None)
+            return msgspec.msgpack.encode(command)
         if name == "Intent":
             intent = msgspec.msgpack.decode(payload)
             asked = intent.pop("action")
@@ -49,13 +59,16 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         del then["properties"]["model"]
         del then["$defs"]["TargetEstimate"]["properties"]["sigma_m"]
         then["properties"]["mood"] = {"type": "string"}
-        intent = infos["calliope/executive/intent"].schema
-        assert intent is not None
-        shape = json.loads(intent.data)
-        shape["properties"]["behaviour"] = shape["properties"].pop("action")
-        infos["calliope/executive/intent"] = infos["calliope/executive/intent"]._replace(
-            schema=intent._replace(data=json.dumps(shape).encode())
-        )
+        for key, names in (
+            ("calliope/executive/intent", {"action": "behaviour"}),
+            ("calliope/base/command", {"ahead_mps": "left_mps", "turn_radps": "right_mps"}),
+        ):
+            kind = infos[key].schema
+            assert kind is not None
+            shape = json.loads(kind.data)
+            for name, former in names.items():
+                shape["properties"][former] = shape["properties"].pop(name)
+            infos[key] = infos[key]._replace(schema=kind._replace(data=json.dumps(shape).encode()))
         infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
             schema=schema._replace(data=json.dumps(then).encode())
         )
@@ -82,6 +95,7 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: model is new: gets its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: gets its default",
         "calliope/executive/intent: Intent has changed: its former shape is converted",
+        "calliope/base/command: BaseCommand has changed: its former shape is converted",
     }
     assert any("changed since, calliope/planning/status: model is new" in line for line in describe_result(result))
 

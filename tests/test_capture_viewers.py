@@ -109,7 +109,7 @@ def test_rerun_gets_the_messages_of_a_live_mesh(monkeypatch: pytest.MonkeyPatch)
         bus.publisher("calliope/base/state", Qos.STATE).put(b"no message")
         async with room.node("planning") as planning:
             await room.clock.sleep_until(10**9)
-            planning.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.2), stamp_ns=5)
+            planning.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.1, turn_radps=0.2), stamp_ns=5)
             await drive(room, 0.2, frames=False)
 
     waiting = Waiting()
@@ -118,7 +118,7 @@ def test_rerun_gets_the_messages_of_a_live_mesh(monkeypatch: pytest.MonkeyPatch)
     waiting.log_to(rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load()))
     logged = Stream.newest.logged
     assert len(logged["world/body"]) == 10
-    (command,) = logged["curves/wheels/commanded_left"]  # however old it is
+    (command,) = logged["curves/base/commanded_speed"]  # however old it is
     assert command[1].args == (0.1,)
 
 
@@ -140,7 +140,7 @@ def test_what_the_viewer_is_too_slow_for_is_dropped_and_a_frame_first() -> None:
         waiting.put(topics.FRAME.name, picture)
     assert waiting.dropped == 3
     for _ in range(WAITING):
-        waiting.put(topics.BASE_COMMAND.name, BaseCommand(left_mps=0.0, right_mps=0.0))
+        waiting.put(topics.BASE_COMMAND.name, BaseCommand(ahead_mps=0.0, turn_radps=0.0))
     assert waiting.dropped == 5
 
 

@@ -133,8 +133,8 @@ def test_servos_have_as_many_values_as_joints(kind: type[Message], lists: tuple[
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_command_that_is_no_number_cannot_even_be_made(bad: float) -> None:
-    with pytest.raises(ValueError, match="left_mps must be finite"):
-        BaseCommand(left_mps=bad, right_mps=0.0)
+    with pytest.raises(ValueError, match="ahead_mps must be finite"):
+        BaseCommand(ahead_mps=bad, turn_radps=0.0)
     with pytest.raises(ValueError, match="goal_rad must be finite"):
         ServoCommand(joints=("elbow",), goal_rad=(bad,), speed_radps=(1.0,))
 
@@ -145,8 +145,8 @@ def test_a_servos_speed_limit_is_not_negative() -> None:
 
 
 def test_numpys_numbers_are_sent_as_numbers_and_found_by_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    command = BaseCommand(left_mps=np.float64(0.25), right_mps=np.float32(0.5))  # type: ignore[arg-type]
+    command = BaseCommand(ahead_mps=np.float64(0.25), turn_radps=np.float32(0.5))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="a float64 is in a message"):
         encode(command)
     monkeypatch.setattr(publisher, "_ENCODER", msgspec.msgpack.Encoder(enc_hook=publisher._numpy_scalar))
-    assert msgspec.msgpack.decode(encode(command), type=BaseCommand) == BaseCommand(left_mps=0.25, right_mps=0.5)
+    assert msgspec.msgpack.decode(encode(command), type=BaseCommand) == BaseCommand(ahead_mps=0.25, turn_radps=0.5)

@@ -46,7 +46,7 @@ async def test_a_restarted_publisher_is_another_incarnation() -> None:
 async def test_a_topic_carries_its_own_type_alone() -> None:
     async with Mesh().node("base") as node:
         with pytest.raises(TypeError, match="base/state carries BaseState, not BaseCommand"):
-            node.publish(topics.BASE_STATE, BaseCommand(left_mps=0.0, right_mps=0.0))  # type: ignore[misc]
+            node.publish(topics.BASE_STATE, BaseCommand(ahead_mps=0.0, turn_radps=0.0))  # type: ignore[misc]
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ async def test_health_tells_of_every_topic_and_loop() -> None:
 
         node.spawn(loop())
         healths = feeder.stream(topics.HEALTH, service="base")
-        feeder.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0))
+        feeder.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0))
         mesh.mesh.publish(topics.BASE_COMMAND.key("calliope"), b"\xc1")
         await asyncio.sleep(3.5)
         _, first, second = await healths.next(), await healths.next(), await healths.next()
@@ -145,9 +145,9 @@ async def test_a_topic_that_can_be_read_no_more_is_told_at_once_and_so_is_its_re
         )
         await asyncio.sleep(0.3)
         for _ in range(300):
-            feeder.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0), 1)
+            feeder.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0), 1)
             await asyncio.sleep(0.02)
-        feeder.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0))
+        feeder.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0))
         await asyncio.sleep(0.1)
         changes = [b for a, b in pairwise(told) if a[1] != b[1]]
         assert [unreadable for _, unreadable in changes] == [True, False]

@@ -48,7 +48,7 @@ class Echo:
             raise self.raises
         self.steps.append((now_ns, [(sample.topic.name, sample.message.seq) for sample in inputs]))
         commands = [
-            BaseCommand(left_mps=0.1, right_mps=0.1) for sample in inputs if isinstance(sample.message, Detections)
+            BaseCommand(ahead_mps=0.1, turn_radps=0.0) for sample in inputs if isinstance(sample.message, Detections)
         ]
         return [Output(topics.BASE_COMMAND, command) for command in commands]
 

@@ -13,6 +13,7 @@ from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
+from cocoro.differential import wheels_of
 from cocoro.learning.handmap import NominalModel
 from cocoro.messages import (
     BaseCommand,
@@ -167,7 +168,7 @@ class Body:
         if isinstance(message, ServoCommand):
             self.angles.update(zip(message.joints, message.goal_rad, strict=True))
         elif isinstance(message, BaseCommand):
-            self._wheels = message.left_mps, message.right_mps
+            self._wheels = wheels_of(self.robot.base, message)
         elif isinstance(message, PlannerStatus):
             self.status = message
         elif isinstance(message, HandSample | WheelTrial):

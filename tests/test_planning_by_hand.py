@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import hypot
 
 import pytest
 from planner_rig import ROBOT, TICK_S, Planner, standing, started
@@ -41,11 +40,11 @@ def driven(prepare: Callable[[Planner], None] = lambda _: None) -> Planner:
 
 
 def speed(planner: Planner) -> float:
-    return (planner.wheels.left_mps + planner.wheels.right_mps) / 2
+    return planner.wheels.ahead_mps
 
 
 def turn(planner: Planner) -> float:
-    return (planner.wheels.right_mps - planner.wheels.left_mps) / ROBOT.base.wheel_separation_m
+    return planner.wheels.turn_radps
 
 
 def give(planner: Planner, motion: Motion, seconds: float) -> str:
@@ -370,4 +369,4 @@ def test_other_actions_take_no_notice_of_a_motion() -> None:
     planner.motion = AHEAD
     planner.run(0.5)
     assert standing(planner)
-    assert hypot(planner.wheels.left_mps, planner.wheels.right_mps) == 0.0
+    assert (planner.wheels.ahead_mps, planner.wheels.turn_radps) == (0.0, 0.0)

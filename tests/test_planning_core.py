@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from math import hypot
 from typing import Any
 
 import msgpack
@@ -16,6 +15,7 @@ from message_samples import data_of
 from planner_rig import CAN_M, ROBOT, TICK_S, Planner, standing, started
 
 from cocoro import topics
+from cocoro.differential import faster_mps
 from cocoro.messages import Detection, Detections, Message, ServoState
 from cocoro.topics import Topic
 
@@ -31,7 +31,7 @@ def approaching(planner: Planner) -> None:
     """Bring the robot on its way to the can."""
     planner.want("approach", "red_can")
     planner.run(2.0)
-    assert planner.wheels.left_mps > 0.1
+    assert planner.wheels.ahead_mps > 0.1
 
 
 def only_stands(planner: Planner) -> bool:
@@ -125,7 +125,7 @@ def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand
     planner: Planner, topic: Topic[Any]
 ) -> None:
     approaching(planner)
-    full_mps = planner.wheels.left_mps
+    full_mps = planner.wheels.ahead_mps
     assert full_mps > 0.3
     heard_ns = planner.under_test.now_ns
     planner.silent.add(topic.name)
@@ -134,9 +134,9 @@ def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand
         status = planner.tick()
         wheels = planner.wheels
         until_s = (planner.under_test.now_ns - heard_ns) / 1e9 + TICK_S  # it is what counts until the next step
-        ramp_s = max(abs(wheels.left_mps), abs(wheels.right_mps)) / base.wheel_acceleration_mps2
+        ramp_s = faster_mps(base, wheels) / base.wheel_acceleration_mps2
         assert until_s + ramp_s <= base.stand_within_s - base.stand_reserve_s + 1e-9 or standing(planner)
-        if 0 < wheels.left_mps < 0.9 * full_mps:
+        if 0 < wheels.ahead_mps < 0.9 * full_mps:
             assert status.why.startswith("slower, for ")
     assert (planner.under_test.now_ns - heard_ns) / 1e9 <= base.command_timeout_s + 2 * TICK_S
 
@@ -144,18 +144,18 @@ def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand
 @pytest.mark.parametrize("topic", [topics.INTENT, topics.DETECTIONS], ids=lambda topic: topic.name)
 def test_a_short_silence_costs_no_more_speed_than_the_wheels_lose_in_it(planner: Planner, topic: Topic[Any]) -> None:
     approaching(planner)
-    before_mps = planner.wheels.left_mps
+    before_mps = planner.wheels.ahead_mps
     planner.silent = {topic.name}
     while not standing(planner):
         planner.tick()
     planner.silent = set()
     planner.run(0.04)
-    lost_mps = before_mps - planner.wheels.left_mps
+    lost_mps = before_mps - planner.wheels.ahead_mps
     # They slow down from a step before this speed's patience on, until the planner stands, and for two steps more.
     base = ROBOT.base
     slowing_s = base.command_timeout_s - (base.patience_s(before_mps) - TICK_S) + 2 * TICK_S
     assert 0.0 < lost_mps <= slowing_s * base.wheel_acceleration_mps2
-    assert planner.wheels.left_mps > 0.05
+    assert planner.wheels.ahead_mps > 0.05
 
 
 def test_a_clock_that_is_ahead_of_ours_makes_nobody_seem_younger(planner: Planner) -> None:
@@ -173,12 +173,12 @@ def test_a_clock_that_is_ahead_of_ours_makes_nobody_seem_younger(planner: Planne
 
 def test_one_lost_word_costs_little_speed_and_no_stop(planner: Planner) -> None:
     approaching(planner)
-    full_mps = planner.wheels.left_mps
+    full_mps = planner.wheels.ahead_mps
     for topic in (topics.INTENT, topics.DETECTIONS, topics.BASE_STATE):
         planner.silent = {topic.name}
         planner.run(0.06)
         planner.silent = set()
-        assert planner.wheels.left_mps > 0.9 * full_mps
+        assert planner.wheels.ahead_mps > 0.9 * full_mps
         planner.run(0.2)
 
 
@@ -331,4 +331,4 @@ def test_nothing_that_passes_the_border_brings_it_down(
     assert planner.status.why
     limit = ROBOT.base.max_wheel_speed_mps
     for command in planner.under_test.outputs(topics.BASE_COMMAND):
-        assert hypot(command.left_mps, command.right_mps) <= 1.42 * limit
+        assert faster_mps(ROBOT.base, command) <= limit + 1e-9

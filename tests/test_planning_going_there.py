@@ -46,8 +46,8 @@ def test_it_drives_to_the_place_and_looks_there() -> None:
     status = planner.run(1.0)
     assert status.state == "running"
     assert status.distance_m == pytest.approx(1.2, abs=0.01)
-    assert planner.wheels.left_mps > 0.1
-    assert planner.wheels.left_mps == pytest.approx(planner.wheels.right_mps, abs=0.01)
+    assert planner.wheels.ahead_mps > 0.1
+    assert planner.wheels.turn_radps == pytest.approx(0.0, abs=0.04)
     assert -0.9 < planner.angles["neck_tilt"] < -0.2, "it looks down at the floor before it"
 
 
@@ -61,7 +61,7 @@ def test_where_something_stands_there_is_no_room_and_it_says_how_much_there_is()
     planner = standing_at([(1.22, 0.02)])
     planner.want("go-there", place_m=(1.3, 0.02))
     assert planner.run(1.0).state == "running", "what was seen from one side may be wrong"
-    assert planner.wheels.left_mps == 0.0
+    assert planner.wheels.ahead_mps == 0.0
     status = until_over(planner)
     assert (status.state, status.reason) == ("failed", "unreachable")
     assert "no room at (1.30, 0.02)" in status.why
@@ -76,7 +76,7 @@ def test_a_place_within_a_ring_is_out_of_reach_and_it_stays_where_it_is() -> Non
     assert (status.state, status.reason) == ("failed", "unreachable")
     assert "no way to (2.60, 0.00)" in status.why
     assert all(
-        output.message.left_mps <= 0.0  # type: ignore[attr-defined]
+        output.message.ahead_mps <= 0.0  # type: ignore[attr-defined]
         for step in planner.under_test.steps
         for output in step
         if output.topic is topics.BASE_COMMAND

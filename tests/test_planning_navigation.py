@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cocoro.differential import faster_mps
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
@@ -31,8 +32,7 @@ class Base:
 
     def obey(self, command: BaseCommand) -> None:
         self.commands.append(command)
-        speed = (command.left_mps + command.right_mps) / 2
-        turn = (command.right_mps - command.left_mps) / ROBOT.base.wheel_separation_m
+        speed, turn = command.ahead_mps, command.turn_radps
         half = turn * TICK_S / 2
         way = speed * TICK_S
         self.pose = self.pose.compose(Pose2(way * cos(half), way * sin(half), 2 * half))
@@ -40,8 +40,7 @@ class Base:
     @property
     def speeds(self) -> list[tuple[float, float]]:
         """Speed and turn rate of each command."""
-        width = ROBOT.base.wheel_separation_m
-        return [((c.left_mps + c.right_mps) / 2, (c.right_mps - c.left_mps) / width) for c in self.commands]
+        return [(c.ahead_mps, c.turn_radps) for c in self.commands]
 
 
 def driven(distance_m: float, bearing_rad: float, most_s: float = 40.0) -> tuple[Base, bool]:
@@ -67,7 +66,7 @@ def test_from_every_bearing_the_target_comes_to_where_the_arm_reaches(distance_m
     x, y, _ = base.pose.inverse().apply(target)
     assert hypot(x - AIM_M[0], y - AIM_M[1]) < 0.05
     lead = max(CONFIG.acceleration_mps2, CONFIG.turn_acceleration_radps2 * ROBOT.base.wheel_separation_m / 2) * TICK_S
-    assert max(abs(v) for c in base.commands for v in (c.left_mps, c.right_mps)) <= ROBOT.base.max_wheel_speed_mps
+    assert max(faster_mps(ROBOT.base, command) for command in base.commands) <= ROBOT.base.max_wheel_speed_mps
     assert base.speeds[-1] == pytest.approx((0.0, 0.0), abs=lead)
 
 
@@ -105,11 +104,10 @@ def test_a_wheel_that_cannot_go_faster_slows_the_other_and_the_arc_is_kept(
     command = driver.command(0.0, 0.0, TICK_S)
     for _ in range(round(seconds / TICK_S)):
         command = driver.command(speed, turn, TICK_S)
-    fastest = max(abs(command.left_mps), abs(command.right_mps))
+    fastest = faster_mps(ROBOT.base, command)
     assert fastest <= ROBOT.base.max_wheel_speed_mps + 1e-9
     asked_speed, asked_turn = driver._speed_mps, driver._turn_radps
-    width = ROBOT.base.wheel_separation_m
-    is_speed, is_turn = (command.left_mps + command.right_mps) / 2, (command.right_mps - command.left_mps) / width
+    is_speed, is_turn = command.ahead_mps, command.turn_radps
     assert is_speed * asked_turn == pytest.approx(is_turn * asked_speed, abs=1e-9)
 
 
@@ -117,8 +115,7 @@ def test_speeds_change_no_faster_than_they_may() -> None:
     driver, before = Driver(CONFIG, ROBOT.base), (0.0, 0.0)
     for goal in [(0.35, 0.9)] * 60 + [(-0.3, -0.9)] * 90 + [(0.0, 0.0)] * 60:
         command = driver.command(*goal, TICK_S)
-        width = ROBOT.base.wheel_separation_m
-        now = ((command.left_mps + command.right_mps) / 2, (command.right_mps - command.left_mps) / width)
+        now = (command.ahead_mps, command.turn_radps)
         assert abs(now[0] - before[0]) <= CONFIG.acceleration_mps2 * TICK_S + 1e-9
         assert abs(now[1] - before[1]) <= CONFIG.turn_acceleration_radps2 * TICK_S + 1e-9
         before = now
@@ -129,9 +126,9 @@ def test_a_halt_is_zero_at_once_and_nothing_is_left_of_the_motion() -> None:
     driver = Driver(CONFIG, ROBOT.base)
     for _ in range(50):
         driver.command(0.35, 0.5, TICK_S)
-    assert driver.halt() == BaseCommand(left_mps=0.0, right_mps=0.0)
+    assert driver.halt() == BaseCommand(ahead_mps=0.0, turn_radps=0.0)
     assert not driver.moving
-    assert driver.brake(TICK_S) == BaseCommand(left_mps=0.0, right_mps=0.0)
+    assert driver.brake(TICK_S) == BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
 
 def test_the_preview_is_the_way_that_is_driven() -> None:

@@ -109,7 +109,7 @@ async def test_hardware_that_knows_of_no_latch_stands_still_until_the_executive_
             for _ in range(round(seconds / 0.02)):
                 nod = ServoCommand(joints=("neck_tilt",), goal_rad=(-0.5,), speed_radps=(2.0,))
                 rig.operator.publish(topics.ARM_COMMAND, nod)
-                rig.operator.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.3, right_mps=0.3))
+                rig.operator.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.3, turn_radps=0.0))
                 await rig.advance(0.02)
 
         await command(1.0)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cocoro.description import SERVO_COUNT_RAD
+from cocoro.differential import command_of
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
@@ -216,14 +217,14 @@ def run(base: MobileBase, seconds: float, command: BaseCommand | None, start_ns:
 
 def test_wheel_speeds_are_ramped_and_clipped() -> None:
     base = MobileBase(ROBOT.base, exact=True)
-    _, steepest = run(base, 1.0, BaseCommand(left_mps=3.0, right_mps=-3.0))
+    _, steepest = run(base, 1.0, command_of(ROBOT.base, 3.0, -3.0))
     assert (base.ramp.left_mps, base.ramp.right_mps) == (0.5, -0.5)
     assert steepest == pytest.approx(ROBOT.base.wheel_acceleration_mps2)
 
 
 def test_the_base_stops_when_commands_stop() -> None:
     base = MobileBase(ROBOT.base, exact=True)
-    now_ns, _ = run(base, 1.0, BaseCommand(left_mps=0.2, right_mps=0.2))
+    now_ns, _ = run(base, 1.0, BaseCommand(ahead_mps=0.2, turn_radps=0.0))
     now_ns, _ = run(base, 0.7 * ROBOT.base.command_timeout_s, None, now_ns)
     assert base.ramp.left_mps == pytest.approx(0.2)
     assert base.state(now_ns).stopped_by == ""
@@ -234,7 +235,7 @@ def test_the_base_stops_when_commands_stop() -> None:
 
 def test_a_latched_base_stops_refuses_and_does_not_resume_an_old_command() -> None:
     base = MobileBase(ROBOT.base, exact=True)
-    ahead = BaseCommand(left_mps=0.4, right_mps=0.4)
+    ahead = BaseCommand(ahead_mps=0.4, turn_radps=0.0)
     now_ns, _ = run(base, 1.0, ahead)
     base.set_latch("latched")
     now_ns, _ = run(base, 0.25, None, now_ns)
@@ -249,13 +250,13 @@ def test_a_latched_base_stops_refuses_and_does_not_resume_an_old_command() -> No
 def test_a_pressed_bumper_forbids_forward_but_lets_the_base_back_off_and_turn() -> None:
     base = MobileBase(ROBOT.base, exact=True)
     base.bumper = Bumper(left=True)
-    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=0.3, right_mps=0.3))
+    now_ns, _ = run(base, 0.5, BaseCommand(ahead_mps=0.3, turn_radps=0.0))
     assert (base.ramp.left_mps, base.ramp.right_mps) == (0.0, 0.0)
     state = base.state(now_ns)
     assert (state.stopped_by, state.bump_left, state.bump_right) == ("bump", True, False)
-    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=0.3, right_mps=0.1), now_ns)
+    now_ns, _ = run(base, 0.5, command_of(ROBOT.base, 0.3, 0.1), now_ns)
     assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((0.1, -0.1))
-    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=-0.3, right_mps=-0.2), now_ns)
+    now_ns, _ = run(base, 0.5, command_of(ROBOT.base, -0.3, -0.2), now_ns)
     assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((-0.3, -0.2))
     assert base.state(now_ns).stopped_by == ""
 

@@ -287,7 +287,7 @@ def test_a_second_planner_is_not_obeyed_beside_the_first(scene: Scene) -> None:
 
         def refused() -> bool:
             newest = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
-            forged = msgspec.structs.replace(newest, left_mps=0.2, right_mps=0.2, incarnation=true.incarnation ^ 1)
+            forged = msgspec.structs.replace(newest, ahead_mps=0.2, turn_radps=0.0, incarnation=true.incarnation ^ 1)
             thief("put", key=COMMAND, payload=f"0x{msgspec.msgpack.encode(forged).hex()}")
             error = scene.base().last_error
             return error == f"publisher {forged.incarnation:x} commands while {true.incarnation:x} does"
@@ -306,7 +306,7 @@ def test_a_forged_number_leads_nowhere(scene: Scene) -> None:
             true = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
             if true.seq == far:  # that was the forged one, which came here, too
                 return False
-            forged = msgspec.structs.replace(true, left_mps=0.2, right_mps=0.2, seq=far)
+            forged = msgspec.structs.replace(true, ahead_mps=0.2, turn_radps=0.0, seq=far)
             thief("put", key=COMMAND, payload=f"0x{msgspec.msgpack.encode(forged).hex()}")
             return str(far) in scene.base().last_error
 

@@ -119,7 +119,7 @@ async def test_a_component_is_found_by_its_modules_name_and_its_settings_are_che
 
 def test_a_core_by_hand_gets_what_it_reads_and_nothing_else() -> None:
     core = CoreUnderTest(Answer())
-    core.feed(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0))
+    core.feed(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0))
     assert core.step() == []
     for _ in range(2):
         core.feed(topics.INTENT, idle())

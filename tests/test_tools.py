@@ -56,23 +56,23 @@ def test_what_is_no_key_is_refused_with_an_example(text: str) -> None:
 
 
 def command(**fields: Any) -> bytes:
-    return msgspec.msgpack.encode(BaseCommand(left_mps=0.1, right_mps=0.2, seq=7, **fields))
+    return msgspec.msgpack.encode(BaseCommand(ahead_mps=0.1, turn_radps=0.2, seq=7, **fields))
 
 
 def test_a_known_type_is_named_and_a_good_message_of_it_has_no_problem() -> None:
     reading = read(command(), "base/command")
     assert (reading.type, reading.problem) == ("BaseCommand", "")
-    assert reading.value["left_mps"] == 0.1
+    assert reading.value["ahead_mps"] == 0.1
 
 
 @pytest.mark.parametrize(
     ("payload", "problem"),
     [
-        (msgpack.packb({"left_mps": "fast"}), "no good BaseCommand: Expected `float`, got `str`"),
-        (msgpack.packb({"left_mps": math.nan, "right_mps": 0.0}), "no good BaseCommand"),
+        (msgpack.packb({"ahead_mps": "fast"}), "no good BaseCommand: Expected `float`, got `str`"),
+        (msgpack.packb({"ahead_mps": math.nan, "turn_radps": 0.0}), "no good BaseCommand"),
         (b"\xc1\x00", "not MessagePack"),
         (b"", "not MessagePack"),
-        (msgpack.packb({"left_mps": 0.1, "right_mps": 0.1, "more": "x" * 70_000}), "at most 65536 are taken"),
+        (msgpack.packb({"ahead_mps": 0.1, "turn_radps": 0.1, "more": "x" * 70_000}), "at most 65536 are taken"),
     ],
 )
 def test_what_a_reader_would_reject_is_said_with_the_reason(payload: bytes, problem: str) -> None:
@@ -127,7 +127,7 @@ def test_rate_jitter_and_data_are_of_the_window() -> None:
     meter = RateMeter("calliope/base/command", 50.0, window_s=1.0)
     for number in range(301):
         late_s = 0.002 if number % 2 else 0.0
-        message = BaseCommand(left_mps=0, right_mps=0, seq=number, incarnation=1, stamp_ns=1 + number * 40_000_000)
+        message = BaseCommand(ahead_mps=0, turn_radps=0.0, seq=number, incarnation=1, stamp_ns=1 + number * 40_000_000)
         meter.hear(msgspec.msgpack.encode(message), number * 0.02 + late_s)
     report = meter.report(6.0)
     assert report is not None
@@ -158,7 +158,7 @@ def test_a_key_that_stops_loses_its_rate_and_that_is_said() -> None:
 def test_gaps_in_the_sequence_are_losses_and_a_restart_is_none() -> None:
     meter = RateMeter("calliope/base/command", None, window_s=5.0)
     for at_s, (incarnation, seq) in enumerate([(1, 5), (1, 6), (1, 9), (2, 0), (2, 2)]):
-        message = BaseCommand(left_mps=0, right_mps=0, seq=seq, incarnation=incarnation)
+        message = BaseCommand(ahead_mps=0, turn_radps=0.0, seq=seq, incarnation=incarnation)
         meter.hear(msgspec.msgpack.encode(message), float(at_s))
     report = meter.report(4.0)
     assert report is not None
@@ -168,7 +168,7 @@ def test_gaps_in_the_sequence_are_losses_and_a_restart_is_none() -> None:
 def test_a_number_that_cannot_be_traffic_is_no_loss() -> None:
     meter = RateMeter("calliope/base/command", 50.0, window_s=5.0)
     for number, seq in enumerate([5, 6, 2**62, 7, 9]):
-        message = BaseCommand(left_mps=0, right_mps=0, seq=seq, incarnation=1, stamp_ns=number * 20_000_000)
+        message = BaseCommand(ahead_mps=0, turn_radps=0.0, seq=seq, incarnation=1, stamp_ns=number * 20_000_000)
         meter.hear(msgspec.msgpack.encode(message), number * 0.02)
     report = meter.report(0.1)
     assert report is not None

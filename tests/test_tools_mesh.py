@@ -46,9 +46,9 @@ async def robot() -> AsyncIterator[None]:
 
         async def talk() -> None:
             async for _ in planning.every(50.0):
-                planning.publish(BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.1))
+                planning.publish(BASE_COMMAND, BaseCommand(ahead_mps=0.1, turn_radps=0.0))
                 foreign.put(msgpack.packb({"height_m": 1.5, "raw": b"123"}))
-                rude.put(msgpack.packb({"left_mps": "fast"}))
+                rude.put(msgpack.packb({"ahead_mps": "fast"}))
 
         planning.ready()
         base.ready("all is well")
@@ -74,7 +74,7 @@ def test_echo_prints_messages_of_types_that_it_knows_and_of_others(
     assert on_mesh(lambda: echo.print_messages(ANY, "*/command", 4, None, True, False)) == exits.DONE
     heard = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert len(heard) == 4
-    good = [entry["message"]["left_mps"] for entry in heard if "problem" not in entry]
+    good = [entry["message"]["ahead_mps"] for entry in heard if "problem" not in entry]
     bad = [entry["problem"] for entry in heard if "problem" in entry]
     assert set(good) == {0.1}
     assert bad

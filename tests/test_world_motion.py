@@ -83,7 +83,7 @@ def test_silence_stops_wheels_and_arm(empty: World) -> None:
 
 
 def test_until_the_latch_is_known_nothing_moves(empty: World) -> None:
-    assert empty.command_base(BaseCommand(left_mps=0.2, right_mps=0.2)) == "latch unknown"
+    assert empty.command_base(BaseCommand(ahead_mps=0.2, turn_radps=0.0)) == "latch unknown"
     order = ServoCommand(joints=("neck_pan",), goal_rad=(1.0,), speed_radps=(1.0,))
     assert empty.command_servos("arm", order) == "latch unknown"
     for _ in range(60):

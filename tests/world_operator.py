@@ -8,7 +8,8 @@ from math import asin, atan2, cos, pi, radians
 import numpy as np
 
 from cocoro.arrays import FloatArray
-from cocoro.messages import BaseCommand, ServoCommand, TrueObject, Truth
+from cocoro.differential import command_of
+from cocoro.messages import ServoCommand, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.judge import Judge
 from sim.scene import Obstacle, Scene, SceneObject
@@ -57,7 +58,7 @@ class Operator:
                             ),
                         )
                 if wheels_mps:
-                    self.world.command_base(BaseCommand(left_mps=wheels_mps[0], right_mps=wheels_mps[1]))
+                    self.world.command_base(command_of(self.world.robot.base, *wheels_mps))
             self.world.step()
             if step % 8 == 7:
                 truth = self.world.truth()

@@ -3,6 +3,7 @@
 A type that was renamed, or whose recorded messages today's type cannot decode, has a rule here. The rules apply
 wherever a capture's messages are read as today's types, in re-execution, exports and replays:
 
+- a `BaseCommand` with the speeds of a Calliope's two wheels becomes one with the body's;
 - a recorded schema `Clock` is today's `ClockTick`;
 - an `Intent` that has its action's name in `behaviour`, and the fields of all actions beside it, becomes one that has
   an `action` with the fields of that action alone;
@@ -22,6 +23,8 @@ RENAMED = {"Clock": "ClockTick"}
 """Today's name of a type, by its name in recorded schemas."""
 
 _INTENT_FIELDS = ("stamp_ns", "seq", "incarnation", "task_id", "step")
+_WHEELS_M = 0.261
+"""Distance of a Calliope's wheels, by its description: whatever was recorded with wheel speeds was one."""
 _ACTION_FIELDS: Mapping[str, Mapping[str, Any]] = {
     **{key: {"label": ""} for key in ("search", "explore", "approach", "reach", "grasp", "lift", "follow", "touch")},
     "carry": {"label": "", "place_m": [0.0, 0.0]},
@@ -65,7 +68,8 @@ def is_former(schema: str, data: bytes) -> bool:
         properties = json.loads(data).get("properties", {})
     except (ValueError, AttributeError):
         return False
-    return schema == "Intent" and "behaviour" in properties
+    former = {"Intent": "behaviour", "BaseCommand": "left_mps"}
+    return former.get(schema) in properties
 
 
 def _intent(message: dict[str, Any]) -> dict[str, Any] | None:
@@ -75,6 +79,14 @@ def _intent(message: dict[str, Any]) -> dict[str, Any] | None:
     kept: dict[str, Any] = {field: value for field, value in message.items() if field in _INTENT_FIELDS}
     kept["action"] = {"action": name, **_fields(message, _ACTION_FIELDS.get(name, {}))}
     return kept
+
+
+def _base_command(message: dict[str, Any]) -> dict[str, Any] | None:
+    left, right = message.get("left_mps"), message.get("right_mps")
+    if not isinstance(left, int | float) or not isinstance(right, int | float):
+        return None
+    kept = {field: value for field, value in message.items() if field not in ("left_mps", "right_mps")}
+    return {**kept, "ahead_mps": (left + right) / 2, "turn_radps": (right - left) / _WHEELS_M}
 
 
 def _exchange(message: dict[str, Any]) -> dict[str, Any] | None:
@@ -93,5 +105,9 @@ def _fields(message: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str
     return {field: defaults[field] if value is None else value for field, value in found.items()}
 
 
-_RULES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any] | None]] = {"Intent": _intent, "Exchange": _exchange}
+_RULES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any] | None]] = {
+    "BaseCommand": _base_command,
+    "Intent": _intent,
+    "Exchange": _exchange,
+}
 """By today's name of a type, what makes today's message of a former one; None of one that is of today."""

@@ -88,14 +88,19 @@ class BaseState(Message):
 
 
 class BaseCommand(Message):
-    """Wheel speeds. They are valid for the base's `command_timeout_s`, at higher speeds for less (`Base.patience_s`);
-    then the base commands zero."""
+    """The body's speeds. They are valid for the base's `command_timeout_s`, at higher speeds for less
+    (`Base.patience_s`); then the base commands zero. What wheels it has and how fast they turn for that, the base
+    knows. A base that cannot move so does not obey."""
 
-    left_mps: Finite
-    right_mps: Finite
+    ahead_mps: Finite
+    """Of the body frame's origin along its x axis."""
+    turn_radps: Finite
+    """Counter-clockwise."""
+    aside_mps: Finite = 0.0
+    """To the left. Only a base whose wheels roll sideways can."""
 
     def __post_init__(self) -> None:
-        require_finite(self, "left_mps", "right_mps")
+        require_finite(self, "ahead_mps", "turn_radps", "aside_mps")
 
 
 class ServoState(Message):

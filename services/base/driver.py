@@ -6,6 +6,7 @@ import msgspec
 
 from cocoro.clock import NS, is_fresh
 from cocoro.description import Base
+from cocoro.differential import wheels_of
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
@@ -63,13 +64,15 @@ class BaseDriver:
     # --- commands -----------------------------------------------------------------------------------
 
     def command(self, command: BaseCommand, now_ns: int) -> None:
-        """Accept wheel speeds. They expire `Base.patience_s` after the command's stamp, the sooner the faster."""
+        """Accept speeds, but none aside: such a command is not obeyed, and the one before it expires. They expire
+        `Base.patience_s` after the command's stamp, the sooner the faster."""
         if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
+            return
+        if command.aside_mps:
             return
         limit_mmps = self._base.max_wheel_speed_mps * 1000.0
         left, right = (
-            round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps))
-            for speed_mps in (command.left_mps, command.right_mps)
+            round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps)) for speed_mps in wheels_of(self._base, command)
         )
         self._wanted_mmps = left, right
         patience_s = self._base.patience_s(max(abs(left), abs(right)) / 1000.0)

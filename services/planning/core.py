@@ -99,7 +99,7 @@ class PlanningCore:
         if missing or hand is None or body is None:
             # An explicit zero: silence would let the base hold its last command until that expires.
             return [
-                Output(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0)),
+                Output(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0)),
                 *self._halt(missing or "no odometry yet", now_ns),
             ]
         self.actuators.grip.feel(hand, now_ns)

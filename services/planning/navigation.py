@@ -12,6 +12,7 @@ from math import asin, atan2, copysign, hypot, sin, sqrt
 from typing import NamedTuple
 
 from cocoro.description import Base
+from cocoro.differential import command_of, faster_mps
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.messages import BaseCommand
 from services.planning.config import NavigationConfig
@@ -49,7 +50,7 @@ def offset_to(target_m: tuple[float, float], aim_m: tuple[float, float]) -> Offs
 
 
 class Driver:
-    """Converts the rest of a drive into wheel speeds, with bounded acceleration."""
+    """Converts the rest of a drive into commands, with bounded acceleration."""
 
     def __init__(self, config: NavigationConfig, base: Base) -> None:
         self._config = config
@@ -147,33 +148,33 @@ class Driver:
         excess = max(abs(left), abs(right)) / self._base.max_wheel_speed_mps
         if excess > 1.0:
             left, right = left / excess, right / excess
-        return BaseCommand(left_mps=left, right_mps=right)
+        return command_of(self._base, left, right)
 
     def within(self, command: BaseCommand, limit_mps: float) -> BaseCommand:
         """Scale a command on its arc until no wheel exceeds a limit; the next command continues from there."""
-        faster_mps = max(abs(command.left_mps), abs(command.right_mps))
-        if faster_mps <= limit_mps:
+        fastest_mps = faster_mps(self._base, command)
+        if fastest_mps <= limit_mps:
             return command
-        share = limit_mps / faster_mps
+        share = limit_mps / fastest_mps
         self._speed_mps *= share
         self._turn_radps *= share
-        return BaseCommand(left_mps=share * command.left_mps, right_mps=share * command.right_mps)
+        return BaseCommand(ahead_mps=share * command.ahead_mps, turn_radps=share * command.turn_radps)
 
     def pause(self, dt_s: float) -> BaseCommand:
         """A zero command while a publisher is late. The next command continues from the speed that the base's own
         ramp has left."""
         half = self._turn_radps * self._separation_m / 2
-        faster_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))
-        left_mps = max(faster_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
-        share = left_mps / faster_mps if faster_mps > 0.0 else 0.0
+        fastest_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))
+        rest_mps = max(fastest_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
+        share = rest_mps / fastest_mps if fastest_mps > 0.0 else 0.0
         self._speed_mps *= share
         self._turn_radps *= share
-        return BaseCommand(left_mps=0.0, right_mps=0.0)
+        return BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
     def halt(self) -> BaseCommand:
         """A zero command without a ramp of the planner; the base's own ramp remains."""
         self.reset()
-        return BaseCommand(left_mps=0.0, right_mps=0.0)
+        return BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
     def brake(self, dt_s: float) -> BaseCommand:
         return self.command(0.0, 0.0, dt_s)

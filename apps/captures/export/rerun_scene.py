@@ -137,8 +137,8 @@ class RerunScene:
         elif isinstance(message, ServoState):
             self._servos(message)
         elif isinstance(message, BaseCommand):
-            self._curve("wheels/commanded_left", message.left_mps)
-            self._curve("wheels/commanded_right", message.right_mps)
+            self._curve("base/commanded_speed", message.ahead_mps)
+            self._curve("base/commanded_turn", message.turn_radps)
         elif isinstance(message, PlannerStatus):
             self._plan(message)
         elif isinstance(message, TaskState):

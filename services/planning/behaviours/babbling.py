@@ -11,6 +11,7 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output
+from cocoro.differential import command_of
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand, HandSample, WheelTrial
 from cocoro.messages.actions import BabbleArm, BabbleWheels
@@ -216,11 +217,11 @@ class WheelBabbling:
     def _drive(self, snapshot: Snapshot, spent_s: float) -> BaseCommand:
         if spent_s < self.TURN_S:
             left, right = self._speeds
-            return BaseCommand(left_mps=left, right_mps=right)
+            return command_of(snapshot.actuators.robot.base, left, right)
         snapshot.actuators.driver.reset()
         if snapshot.standing:
             self._driving, self._phase_ns = False, None
-        return BaseCommand(left_mps=0.0, right_mps=0.0)
+        return BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
     def _look_there(self, snapshot: Snapshot) -> tuple[float, float, float] | None:
         target = snapshot.target(self._label)

@@ -138,7 +138,7 @@ def _what(motion: Motion, base: BaseCommand) -> str:
     if motion.zero:
         return "at rest: nothing is held"
     if motion.speed_mps:
-        return f"driving by hand, {(base.left_mps + base.right_mps) / 2:+.2f} m/s"
+        return f"driving by hand, {base.ahead_mps:+.2f} m/s"
     if motion.base:
         return "turning by hand"
     return "turning the head" if motion.head else "moving the claws"
