@@ -28,25 +28,30 @@ class Viewer:
         assert where.hostname is not None
         self._socket = socket.create_connection((where.hostname, where.port or 80), PATIENCE_S)
         self._bytes = self._socket.makefile("rb")
-        key = base64.b64encode(os.urandom(16)).decode()
-        came = "" if origin is None else f"Origin: {origin}\r\n"
-        self._socket.sendall(
-            f"GET / HTTP/1.1\r\nHost: {where.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"{came}"
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
-            .encode()
-        )  # fmt: skip
-        if b"101" not in self._bytes.readline():
-            why = self._bytes.read().decode()
-            self.close()
-            raise ConnectionError(why)
-        while self._bytes.readline().strip():
-            pass
         self.channels: dict[str, dict[str, Any]] = {}
         """What the server says of each topic."""
         self.services: dict[str, dict[str, Any]] = {}
         self.topics: dict[int, str] = {}
         """The topic of each subscription."""
+        try:
+            self._greet(where.netloc, origin)
+        except BaseException:
+            self.close()
+            raise
+
+    def _greet(self, netloc: str, origin: str | None) -> None:
+        key = base64.b64encode(os.urandom(16)).decode()
+        came = "" if origin is None else f"Origin: {origin}\r\n"
+        self._socket.sendall(
+            f"GET / HTTP/1.1\r\nHost: {netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"{came}"
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
+            .encode()
+        )  # fmt: skip
+        if b"101" not in self._bytes.readline():
+            raise ConnectionError(self._bytes.read().decode())
+        while self._bytes.readline().strip():
+            pass
         while not self.channels:
             self.next()
 

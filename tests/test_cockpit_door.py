@@ -7,8 +7,8 @@ import os
 import random
 import socket
 import struct
-from collections.abc import Awaitable, Callable, Coroutine
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager, suppress
 from functools import wraps
 from typing import Any
 
@@ -61,12 +61,26 @@ class Client:
                 found += data
         except ConnectionError:
             pass
-        self.writer.close()
+        finally:  # also when the call is cancelled, or the other side refuses it in TLS
+            self.writer.transport.abort()
         return found
 
     async def __call__(self, data: bytes) -> bytes:
         self.writer.write(data)
         return await self.rest()
+
+
+@asynccontextmanager
+async def silent(cockpit: Open, count: int) -> AsyncIterator[None]:
+    """So many connections that ask nothing."""
+    writers: list[asyncio.StreamWriter] = []
+    try:
+        for _ in range(count):
+            writers.append((await asyncio.open_connection("127.0.0.1", cockpit.port))[1])  # noqa: PERF401 # may fail
+        yield
+    finally:
+        for writer in writers:
+            writer.transport.abort()
 
 
 def request(cockpit: Open, path: str = "/", method: str = "GET", more: str = "") -> bytes:
@@ -155,26 +169,20 @@ async def test_a_connection_that_asks_no_more_is_ended() -> None:
 @in_real_time
 async def test_five_hundred_silent_sockets_keep_nobody_out() -> None:
     limits = QUICK._replace(first_s=60.0)
-    async with served(door_limits=limits) as cockpit:
-        held = [await asyncio.open_connection("127.0.0.1", cockpit.port) for _ in range(500)]
+    async with served(door_limits=limits) as cockpit, silent(cockpit, 500):
         assert len(cockpit.taken()) <= limits.each
         assert await is_served(cockpit)
         assert cockpit.audit.has("ended to make room")
-        for _, writer in held:
-            writer.close()
 
 
 @in_real_time
 async def test_sockets_that_are_served_are_not_ended_for_newcomers() -> None:
     async with served(door_limits=QUICK._replace(first_s=60.0, each=4)) as cockpit:
         url = f"ws://127.0.0.1:{cockpit.port}/live"
-        async with connect(url) as one, connect(url) as other:
-            held = [await asyncio.open_connection("127.0.0.1", cockpit.port) for _ in range(50)]
+        async with connect(url) as one, connect(url) as other, silent(cockpit, 50):
             for page in (one, other):
                 await page.send("still here")
                 assert await page.recv() == "still here"
-            for _, writer in held:
-                writer.close()
 
 
 @in_real_time
@@ -182,8 +190,8 @@ async def test_new_connections_beyond_the_rate_are_refused_and_pages_are_served(
     limits = QUICK._replace(takes=Rate(1e-6, 10.0))
     async with served(door_limits=limits) as cockpit, connect(f"ws://127.0.0.1:{cockpit.port}/live") as page:
         for _ in range(200):
-            _, writer = await asyncio.open_connection("127.0.0.1", cockpit.port)
-            writer.close()
+            async with silent(cockpit, 1):
+                pass
         await until(lambda: cockpit.audit.refusals >= 191)
         assert cockpit.audit.has("too many in a second")
         await page.send("still here")
@@ -361,12 +369,13 @@ async def test_the_kernel_and_its_tables_agree_on_whose_a_connection_is() -> Non
     peers = Peers()
     for host in ("127.0.0.1", "::1"):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, 0), family=family) as listener:
-            client = socket.create_connection(listener.getsockname()[:2])
-            taken, _ = listener.accept()
+        with (
+            socket.create_server((host, 0), family=family) as listener,
+            socket.create_connection(listener.getsockname()[:2]) as client,
+            listener.accept()[0] as taken,
+        ):
             ends = taken.getpeername()[:2], taken.getsockname()[:2]
             assert peers.user(*ends) == _listed(*ends) == os.getuid()
             client.close()
             assert peers.user(*ends) is _listed(*ends) is None
-            taken.close()
     peers.close()

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 import msgspec
 import pytest
 from cockpit_access_rig import Open, served
-from test_cockpit_door import QUICK, Client, in_real_time, until
+from test_cockpit_door import QUICK, Client, in_real_time, silent, until
 
 from cocoro.errors import ConfigError
 from deploy.site import authority
@@ -340,11 +340,8 @@ async def test_no_one_logs_in_where_nothing_is_encrypted(short_path: Path) -> No
 @in_real_time
 async def test_half_done_handshakes_are_few_and_end(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.cockpit.access_door.HANDSHAKE_S", 0.3)
-    async with served(**remote(lab)) as cockpit:
-        held = [await asyncio.open_connection("127.0.0.1", cockpit.port) for _ in range(30)]
+    async with served(**remote(lab)) as cockpit, silent(cockpit, 30):
         await until(lambda: cockpit.audit.has("too many handshakes"))
         await until(lambda: not cockpit.taken())
         assert cockpit.audit.has("TLS handshake failed")
         assert (await get(cockpit, lab.client("ada")))[9:12] == b"200"
-        for _, writer in held:
-            writer.close()
