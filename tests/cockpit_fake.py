@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import uvicorn
 from cockpit_world import HEIGHT, OBJECTS, TASKS, WIDTH, World, captures
+from operator_shell import PATIENCE_S
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -33,7 +34,6 @@ POLICY = (
     " base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
 FPS = 8.0
-PATIENCE_S = 30.0
 LINE = {"level": "info", "service": "planning", "text": "drives around the box"}
 LINES: list[dict[str, Any]] = [{}, {"level": "warning", "service": "perception", "text": "a frame was late: 140 ms"}]
 GONE = (WebSocketDisconnect, RuntimeError)

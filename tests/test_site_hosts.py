@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from operator_shell import PATIENCE_S
 
 from apps.cli import exits
 from bench.site_lab import BODY, BRAIN, DESK, ROBOT, Lab, lab
@@ -20,8 +21,6 @@ from deploy.site import authority, place
 from sim.network.network import Host, obstacle
 
 pytestmark = [pytest.mark.process, pytest.mark.zenoh, pytest.mark.skipif(bool(obstacle()), reason=obstacle() or "-")]
-
-PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope="module")
