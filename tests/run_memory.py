@@ -25,6 +25,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 LOOK_S = 0.5
+AGAIN = 10
+"""So many looks later at the latest a process is measured again, and asked again whether it has the mark, which it
+may have got by exec."""
+CHANGED_MB = 1.0
+"""A process whose resident memory has changed by this is measured at once. Otherwise not at each look, since the kernel
+walks all its pages for that, which takes milliseconds."""
 LEAST_MB = 40.0
 """A worker alone: what it has written to of the memory that it shared at first. No test counts as needing less."""
 SHOWN = 12
@@ -38,6 +44,7 @@ RUNNING = "running-"
 """Before the number of a worker: the file that has the test that it runs."""
 WORKER = "COCORO_TESTS_WORKER"
 """Environment variable of what tests start: the number of the worker that runs them."""
+_PAGE = resource.getpagesize()
 _FIELD = re.compile(rb"^(Pss|Private_Clean|Private_Dirty):\s+(\d+) kB", re.MULTILINE)
 _TEST = re.compile(rb"(?:^|\0)PYTEST_CURRENT_TEST=([^\0]+) \(\w+\)")
 _WORKER = re.compile(rb"(?:^|\0)" + WORKER.encode() + rb"=(\d+)")
@@ -61,6 +68,17 @@ class Origin(NamedTuple):
     """The number of the worker of that test."""
 
 
+class Measured(NamedTuple):
+    """A process when it was measured last."""
+
+    title: str
+    memory: Memory
+    resident_mb: float
+    look: int
+    sharers: int
+    """How many processes ran tests: they share memory with one another."""
+
+
 class Seen(NamedTuple):
     """A process at one look."""
 
@@ -80,8 +98,11 @@ class Watch:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._mark = f"COCORO_TESTS_RECORD={folder}".encode()
-        self._ours: dict[tuple[str, str], Origin] = {}
+        self._ours: dict[tuple[str, bytes], Origin] = {}
         """By number and time of birth."""
+        self._strangers: set[tuple[str, bytes]] = set()
+        """Those without the mark."""
+        self._measured: dict[tuple[str, bytes], Measured] = {}
         self.peak_mb, self.at_s = 0.0, 0.0
         self.looks: list[tuple[float, float, dict[str, float]]] = []
         """Time in s, sum in MB, and its parts by the file of tests."""
@@ -95,25 +116,15 @@ class Watch:
 
     def look(self) -> None:
         """Sum the memory of all that run now."""
-        now: dict[tuple[str, str], Origin] = {}
+        self._find()
         found: list[Seen] = []
-        for name in os.listdir("/proc"):  # noqa: PTH208 # many times a minute
-            if not name.isdigit() or int(name) == os.getpid():
-                continue
+        sharers = sum(not origin.test for origin in self._ours.values())
+        for (name, born), origin in self._ours.items():
             with suppress(OSError, IndexError):
-                process = Path("/proc") / name
-                born = process.joinpath("stat").read_text(errors="replace").rpartition(")")[2].split()[19]
-                origin = self._ours.get((name, born))
-                if origin is None or not origin.test:
-                    environment = process.joinpath("environ").read_bytes()
-                    if self._mark not in environment and origin is None:
-                        continue
-                    origin = _origin(environment)
-                now[name, born] = origin
                 runs = self._runs(origin.worker if origin.test else name)
                 test = origin.test or runs
-                found.append(Seen(_title(process), memory_mb(process), test, runs or test, worker=not origin.test))
-        self._ours = now
+                now = self._measure((name, born), 0 if origin.test else sharers)
+                found.append(Seen(now.title, now.memory, test, runs or test, worker=not origin.test))
         total_mb, at_s = sum(seen.memory.part for seen in found), time.monotonic() - self._begun_s
         parts: dict[str, float] = defaultdict(float)
         own_mb: dict[str, float] = defaultdict(float)
@@ -127,6 +138,46 @@ class Watch:
             self.peak_mb, self.at_s = total_mb, at_s
             largest = sorted(found, key=lambda one: -one.memory.part)[:SHOWN]
             self.largest = [(seen.title, round(seen.memory.part, 1), seen.test) for seen in largest]
+
+    def _find(self) -> None:
+        """Find the processes with the mark."""
+        if len(self.looks) % AGAIN == 0:
+            self._strangers = set()
+        ours: dict[tuple[str, bytes], Origin] = {}
+        strangers: set[tuple[str, bytes]] = set()
+        for name in os.listdir("/proc"):  # noqa: PTH208 # many times a minute
+            if not name.isdigit() or int(name) == os.getpid():
+                continue
+            with suppress(OSError, IndexError):
+                born = _read(name, "stat").rpartition(b")")[2].split()[19]
+                origin = self._ours.get((name, born))
+                if (name, born) in self._strangers:
+                    strangers.add((name, born))
+                    continue
+                if origin is None or not origin.test:
+                    environment = _read(name, "environ")
+                    if self._mark not in environment and origin is None:
+                        strangers.add((name, born))
+                        continue
+                    origin = _origin(environment)
+                ours[name, born] = origin
+        self._ours, self._strangers = ours, strangers
+        self._measured = {key: measured for key, measured in self._measured.items() if key in ours}
+
+    def _measure(self, key: tuple[str, bytes], sharers: int) -> Measured:
+        """Measure a process, unless it has hardly changed since it was measured last."""
+        name, look = key[0], len(self.looks)
+        resident_mb = int(_read(name, "statm").split()[1]) * _PAGE / 1e6
+        last = self._measured.get(key)
+        if (
+            last is None
+            or look - last.look >= AGAIN
+            or last.sharers != sharers
+            or abs(resident_mb - last.resident_mb) >= CHANGED_MB
+        ):
+            process = Path("/proc") / name
+            last = self._measured[key] = Measured(_title(name), memory_mb(process), resident_mb, look, sharers)
+        return last
 
     def _runs(self, number: str) -> str:
         try:
@@ -143,7 +194,7 @@ def memory_mb(process: Path) -> Memory:
         own_mb = sizes.get(b"Private_Clean", 0.0) + sizes.get(b"Private_Dirty", 0.0)
         return Memory(sizes.get(b"Pss", 0.0), own_mb)
     except PermissionError:  # a process of another user: what is shared is counted whole
-        whole_mb = int(process.joinpath("statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        whole_mb = int(process.joinpath("statm").read_text().split()[1]) * _PAGE / 1e6
         return Memory(whole_mb, whole_mb)
 
 
@@ -152,8 +203,14 @@ def _origin(environment: bytes) -> Origin:
     return Origin(test[1].decode() if test else "", worker[1].decode() if worker else "")
 
 
-def _title(process: Path) -> str:
-    words = process.joinpath("cmdline").read_bytes().decode(errors="replace").split("\0")
+def _read(process: str, file: str) -> bytes:
+    """A file of the process in /proc."""
+    with open(f"/proc/{process}/{file}", "rb", buffering=0) as opened:  # noqa: PTH123 # thousands of times a minute
+        return opened.readall()
+
+
+def _title(process: str) -> str:
+    words = _read(process, "cmdline").decode(errors="replace").split("\0")
     return " ".join(Path(word).name if "/" in word else word for word in words)[:60].strip()
 
 

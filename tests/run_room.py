@@ -22,13 +22,25 @@ BUDGET_MB = 820.0
 LARGE_MB = 400.0
 """The tests of a file that need more are a job of their own, so that the rest fits beside more. Not so where they share
 a fixture of their file: what it has started runs during all of them, and each job would start it again."""
-GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
+GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0), ({"zenoh", "process"}, 120.0), ({"zenoh"}, 80.0))
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
-TWO_ROBOTS_MB = {
-    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 640.0, "test_site_clocks.py": 400.0,
+USUAL_MB = {
+    # two robots, or one over several hosts
+    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 660.0, "test_site_clocks.py": 410.0,
     "test_site_intruders.py": 820.0,
+    # a browser, some with a robot
+    "test_cockpit_browser.py": 740.0, "test_cockpit_page.py": 470.0, "test_cockpit_page_driving.py": 300.0,
+    "test_cockpit_browser_gate.py": 280.0,
+    # a robot with more processes than most
+    "test_readme.py": 590.0, "test_wire_robot.py": 590.0, "test_stop_live.py": 560.0, "test_client_live.py": 560.0,
+    # one with fewer
+    "test_faults_asleep.py": 370.0,
+    # what they make in the worker, or in a process of their own
+    "test_faults_barrage.py": 410.0, "test_faults_speed.py": 320.0, "test_cli_surroundings.py": 190.0,
+    "test_capture_export.py": 170.0, "test_wall_clock.py": 160.0, "test_declared.py": 150.0,
+    "test_cli_endings.py": 130.0, "test_capture_tables.py": 120.0,
 }  # fmt: skip
-"""Files with two robots, or with one over several hosts, and what their tests with `zenoh` may need."""
+"""Files whose tests need something else than their markers tell, and what the most demanding one needs."""
 URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
 
@@ -60,9 +72,9 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
 def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
     if known is not None and item.nodeid in known:
         return max(known[item.nodeid], LEAST_MB)
-    if item.path.name in TWO_ROBOTS_MB and item.get_closest_marker("zenoh"):
-        return TWO_ROBOTS_MB[item.path.name]
     marks = {mark.name for mark in item.iter_markers()}
+    if item.path.name in USUAL_MB and marks & {"zenoh", "sim", "process"}:
+        return USUAL_MB[item.path.name]
     guesses = (
         GUESSED_MB if known is None else GUESSED_MB[:1]
     )  # what the looks have missed took a moment, as no robot does

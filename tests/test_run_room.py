@@ -11,9 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from run_memory import LEAST_MB, MEMORY, RUNNING, WORKER, Watch
-from run_record import FOLDER
-from run_room import LARGE_MB, TWO_ROBOTS_MB, Room, jobs_of
+import run_memory
+from run_memory import AGAIN, LEAST_MB, MEMORY, RUNNING, WORKER, Watch, memory_mb
+from run_record import FOLDER, LONG, wall_s_of
+from run_room import LARGE_MB, USUAL_MB, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
@@ -41,7 +42,7 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", next(iter(TWO_ROBOTS_MB))))
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", next(iter(USUAL_MB))))
     for folder in (None, tmp_path):
         jobs = jobs_of([*items, robot, robots], folder)
         assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
@@ -50,8 +51,14 @@ def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp
         assert needs_mb == sorted(set(needs_mb))
 
 
-def test_the_file_with_two_robots_is_there() -> None:
-    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS_MB)
+def test_the_files_that_are_known_are_there() -> None:
+    names = {*USUAL_MB, *(f"test_{name}.py" for name in LONG)}
+    assert [name for name in names if not (Path(__file__).parent / name).is_file()] == []
+
+
+def test_without_a_record_the_longest_files_come_first(tmp_path: Path) -> None:
+    took_s = wall_s_of(tmp_path / "none")
+    assert sorted(took_s, key=lambda file: -took_s[file]) == [f"tests/test_{name}.py" for name in LONG]
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
@@ -108,6 +115,38 @@ def test_what_a_fixture_has_started_is_needed_by_every_test_during_which_it_runs
     assert "a::first" not in watch.own_mb
     ((_, _, parts),) = watch.looks
     assert parts["a"] > 60.0
+
+
+@pytest.mark.process
+def test_a_process_is_measured_again_when_it_has_grown_and_otherwise_seldom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[str] = []
+
+    def note(process: Path) -> run_memory.Memory:
+        measured.append(process.name)
+        return memory_mb(process)
+
+    monkeypatch.setattr(run_memory, "memory_mb", note)
+    grows = "held = []\nwhile True: print(flush=True); input(); held.append(bytearray(60_000_000))"
+    with subprocess.Popen(
+        [sys.executable, "-c", grows], env=os.environ | {FOLDER: str(tmp_path)},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as started:  # fmt: skip
+        assert started.stdin is not None
+        assert started.stdout is not None
+        watch = Watch(tmp_path)
+        started.stdout.readline()
+        for _ in range(AGAIN):
+            watch.look()
+        before_mb, times = watch.looks[-1][1], measured.count(str(started.pid))
+        started.stdin.write(b"\n")
+        started.stdin.flush()
+        started.stdout.readline()
+        watch.look()
+        started.kill()
+    assert times == 1
+    assert watch.looks[-1][1] > before_mb + 59.0
 
 
 def test_a_second_robot_waits_and_what_is_small_begins_meanwhile() -> None:
