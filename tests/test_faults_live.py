@@ -84,19 +84,42 @@ def test_who_is_stopped_or_killed_while_driving_leaves_a_robot_that_stands(
     asyncio.run(scenario())
 
 
-def test_a_fetch_ends_well_though_perception_and_planning_die_on_the_way(tmp_path: Path) -> None:
+def test_a_fetch_ends_well_though_perception_and_planning_die_and_its_grip_holds_through_an_emergency_stop(
+    tmp_path: Path,
+) -> None:
     async def scenario() -> None:
         async with live(tmp_path, pace=1.0) as robot:
-            task_id = await robot.begin(asked("fetch", label="red_can"))
-            for service, phase in (("perception", "approach"), ("planning", "lift")):
-                await robot.until(lambda phase=phase: (state := robot.state(task_id)) and state.phase == phase)  # type: ignore[misc]
-                robot.signal(service, signal.SIGKILL)
-                await robot.told(f"{service} was killed by SIGKILL; restart in")
-            state = await robot.outcome(task_id)
-            assert (state.outcome, state.reason) == ("done", "")
+            await fetches_while_they_die(robot)
+            code, said = await robot.command("estop")
+            assert code == 0, said
+            code, said = await robot.command("put-down")
+            assert code == 3, said
+            assert "emergency stop is latched" in said
+            await robot.passes(2.0)
             assert robot.held("red_can")
+            code, said = await robot.command("reset")
+            assert code == 0, said
+            await robot.passes(0.5)
+            assert robot.held("red_can")
+            code, said = await robot.command("put-down")
+            assert code == 0, said
+            await robot.passes(0.5)
+            can = next(item for item in robot.heard(topics.TRUTH)[-1].objects if item.label == "red_can")
+            assert can.touching == ("floor",)
+            assert can.position_m[2] == pytest.approx(0.06, abs=0.003), "it stands"
 
     asyncio.run(scenario())
+
+
+async def fetches_while_they_die(robot: LiveRobot) -> None:
+    task_id = await robot.begin(asked("fetch", label="red_can"))
+    for service, phase in (("perception", "approach"), ("planning", "lift")):
+        await robot.until(lambda phase=phase: (state := robot.state(task_id)) and state.phase == phase)  # type: ignore[misc]
+        robot.signal(service, signal.SIGKILL)
+        await robot.told(f"{service} was killed by SIGKILL; restart in")
+    state = await robot.outcome(task_id)
+    assert (state.outcome, state.reason) == ("done", "")
+    assert robot.held("red_can")
 
 
 def test_who_hangs_is_killed_and_the_task_goes_on_with_its_successor(
@@ -213,32 +236,6 @@ def test_a_simulator_that_is_stopped_stops_time_and_when_it_goes_on_so_does_the_
             await asyncio.sleep(1.0)
             robot.signal("base", signal.SIGCONT)
             await robot.drives(task_id=task_id)
-
-    asyncio.run(scenario())
-
-
-def test_the_grip_holds_through_an_emergency_stop_and_the_can_is_put_down_after_the_reset(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        async with live(tmp_path, pace=1.0) as robot:
-            code, said = await robot.command("fetch", "red_can")
-            assert code == 0, said
-            code, said = await robot.command("estop")
-            assert code == 0, said
-            code, said = await robot.command("put-down")
-            assert code == 3, said
-            assert "emergency stop is latched" in said
-            await robot.passes(2.0)
-            assert robot.held("red_can")
-            code, said = await robot.command("reset")
-            assert code == 0, said
-            await robot.passes(0.5)
-            assert robot.held("red_can")
-            code, said = await robot.command("put-down")
-            assert code == 0, said
-            await robot.passes(0.5)
-            can = next(item for item in robot.heard(topics.TRUTH)[-1].objects if item.label == "red_can")
-            assert can.touching == ("floor",)
-            assert can.position_m[2] == pytest.approx(0.06, abs=0.003), "it stands"
 
     asyncio.run(scenario())
 
