@@ -26,10 +26,10 @@ GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0), ({"zenoh",
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
 USUAL_MB = {
     # two robots, or one over several hosts
-    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 660.0, "test_site_clocks.py": 410.0,
-    "test_site_intruders.py": 820.0,
+    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 690.0, "test_site_clocks.py": 410.0,
+    "test_site_intruders.py": 850.0,
     # a browser, some with a robot
-    "test_cockpit_browser.py": 740.0, "test_cockpit_page.py": 470.0, "test_cockpit_page_driving.py": 300.0,
+    "test_cockpit_browser.py": 740.0, "test_cockpit_page.py": 470.0, "test_cockpit_page_driving.py": 450.0,
     "test_cockpit_browser_gate.py": 280.0,
     # a robot with more processes than most
     "test_readme.py": 590.0, "test_wire_robot.py": 590.0, "test_stop_live.py": 560.0, "test_client_live.py": 560.0,
