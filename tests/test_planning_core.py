@@ -116,6 +116,19 @@ def test_beyond_its_states_age_it_only_stands_and_in_time_it_gives_up(planner: P
     assert planner.commanded == {topic.name for topic in MOVING}
 
 
+@pytest.mark.parametrize(("silent_s", "stands"), [(1.0, True), (3.0, False)])
+def test_after_a_short_silence_the_arm_goes_on_to_its_goal_and_after_a_long_one_it_stays_where_it_is(
+    planner: Planner, silent_s: float, stands: bool
+) -> None:
+    goal_rad = planner.angles["shoulder"]
+    planner.silent.add(topics.ARM_STATE.name)
+    planner.run(silent_s)
+    planner.angles["shoulder"] = stopped_rad = goal_rad - 0.1
+    planner.silent.clear()
+    planner.tick()
+    assert planner.angles["shoulder"] == pytest.approx(goal_rad if stands else stopped_rad)
+
+
 @pytest.mark.parametrize(
     "topic",
     [topics.INTENT, topics.DETECTIONS, topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE],

@@ -21,8 +21,16 @@ from services.planning.reach import HandPose, Reacher
 _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
+_LEAST_PACE_RADPS = 0.3
+_HOLD_RADPS = 0.5
 _SLOWEST_RADPS = 0.02
 """Of a joint that moves: 0 would hold it."""
+_CAREFUL_S = 2.0
+"""So long after a state was late, or a joint lagged, the next command or state may be late, too."""
+_KEPT_S = 2.0
+"""Longest silence after which the arm is still on its way: a service that died takes longer to come back."""
+_SETTLED_RAD = 0.1
+"""On a slow link the arm has arrived when its joints are so near to their goals. (They sag by less.)"""
 _ASTRAY_RAD = 0.6
 """A pitch error above this occurs only after babbling."""
 
@@ -54,7 +62,14 @@ class ArmController:
         """Unfolded in the plane that the arm is in: the hand points away from the arm's foot, level."""
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
+        self._lags = False
+        """A joint is further behind its goal than `wait_rad`."""
         self._lagged_s = 0.0
+        self._late_s = 0.0
+        self._careful_s = 0.0
+        """For so long the link still counts as slow."""
+        self._pace_radps = _LEAST_PACE_RADPS
+        """Speed of the fastest joint when the goals moved last: with it lagging joints catch up."""
         self._astray = False
         """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
@@ -71,11 +86,23 @@ class ArmController:
         self._reference = None
         self._stalled_s = 0.0
         self._lagged_s = 0.0
+        self._late_s = 0.0
         self._clearance_m = None
 
     def undelivered(self) -> None:
         """The commands do not arrive: the arm lags behind its goal, and nothing holds it up."""
         self._stalled_s = 0.0
+        self._lagged_s = 0.0
+
+    def late(self, dt_s: float) -> None:
+        """The state is too old to move by. The arm goes on to its goal, or stops on its way there, so the goal stands;
+        after `_KEPT_S` the arm may be anywhere."""
+        if self._reference is None:
+            return
+        self._late_s += dt_s
+        self._careful_s = _CAREFUL_S
+        if self._late_s > _KEPT_S:
+            self.resync()
 
     def folded(self, angles: Mapping[str, float]) -> bool:
         """Whether the arm is in or near the plane that it parks in."""
@@ -87,7 +114,8 @@ class ArmController:
     def hold(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         reference = self._sync(measured, dt_s)
         goal = np.array([reference[name] for name in self._names])
-        return ArmStep(goal, np.full(len(goal), 0.5), reference[self._roll], 0.0, True)
+        speed = self._together(goal, np.full(len(goal), _HOLD_RADPS))
+        return ArmStep(goal, speed, reference[self._roll], 0.0, True)
 
     def park(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         """One step of folding the arm beside the camera mount."""
@@ -167,16 +195,17 @@ class ArmController:
         names = (*self._names, self._roll)
         if self._reference is None:
             self._reference = {name: measured[name] for name in names}
-        behind = lags = False
-        for name in names:
-            lead = self._reference[name] - measured[name]
-            lags |= abs(lead) > self._config.wait_rad and name != self._roll
-            if abs(lead) > self._config.lead_rad:
-                behind = True
-                self._clearance_m = None
-                self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
+        leads = {name: self._reference[name] - measured[name] for name in names}
+        self._lags = any(abs(leads[name]) > self._config.wait_rad for name in self._names)
+        self._lagged_s = self._lagged_s + dt_s if self._lags else 0.0
+        self._careful_s = _CAREFUL_S if self._lags else max(self._careful_s - dt_s, 0.0)
+        self._late_s = 0.0
+        behind = {name: lead for name, lead in leads.items() if abs(lead) > self._config.lead_rad}
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
-        self._lagged_s = self._lagged_s + dt_s if lags else 0.0
+        if behind and not self._waits:
+            self._clearance_m = None
+            for name, lead in behind.items():
+                self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._measured = np.array([measured[name] for name in self._names])
         return self._reference
 
@@ -184,7 +213,20 @@ class ArmController:
     def _waits(self) -> bool:
         """Whether the goal stands until the joints are nearer to it. Commands or states are late then, and a joint that
         lags alone would bring the hand off its way, down to the floor. What holds a joint up for longer is no delay."""
-        return 0.0 < self._lagged_s < self._config.wait_s
+        return self._lags and self._careful
+
+    @property
+    def _careful(self) -> bool:
+        """Whether joints may be far behind their goals because commands or states are late."""
+        return self._careful_s > 0.0 and self._lagged_s < self._config.wait_s
+
+    def _together(self, goal: FloatArray, speed_radps: FloatArray) -> FloatArray:
+        """Speeds, rad/s, for goals, rad, both (n,). On a slow link all joints arrive at once, so that the hand stays on
+        its way, however far ahead the goals are."""
+        if self._careful_s <= 0.0:
+            return speed_radps
+        gaps = np.abs(goal - self._measured)
+        return np.maximum(gaps * (speed_radps.max() / max(gaps.max(), 1e-6)), _SLOWEST_RADPS)
 
     def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
         """One step of the named joints to their goals; the others stay."""
@@ -212,6 +254,10 @@ class ArmController:
         trial[self._roll] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
+        if self._careful:
+            measured = dict(zip(self._names, self._measured.tolist(), strict=True))
+            place = self._reacher.position({**self._reference, **measured})
+            left = max(left, float(np.linalg.norm(self._reacher.point(goal) - place)))
         return self._commit(trial, left, dt_s, arrived=arrived)
 
     def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> ArmStep:
@@ -226,10 +272,12 @@ class ArmController:
         goal = np.array([trial[name] for name in self._names])
         moved = np.abs(goal - np.array([self._reference[name] for name in self._names]))
         # Faster than the reference, so that a lagging servo can catch up.
-        speed = np.maximum(1.5 * moved / dt_s, 0.3)
-        if self._lagged_s > 0.0:  # all joints arrive at once, so that the hand stays on its way
-            gaps = np.abs(goal - self._measured)
-            speed = np.maximum(gaps * (speed.max() / gaps.max()), _SLOWEST_RADPS)
+        speed = np.maximum(1.5 * moved / dt_s, _LEAST_PACE_RADPS)
+        if waits:
+            speed = np.full(len(goal), self._pace_radps)
+        self._pace_radps = float(speed.max())
         self._reference = trial
         self._clearance_m = before_m if blocked or waits else clearance_m
-        return ArmStep(goal, speed, trial[self._roll], left, arrived and not (blocked or waits), blocked)
+        settled = not self._careful or bool(np.abs(goal - self._measured).max() < _SETTLED_RAD)
+        arrived = arrived and settled and not (blocked or waits)
+        return ArmStep(goal, self._together(goal, speed), trial[self._roll], left, arrived, blocked)

@@ -97,6 +97,7 @@ class PlanningCore:
         self._follow_intent(now_ns)
         missing, hand, body = self._estimator.missing(now_ns), self._estimator.hand, self._estimator.body()
         if missing or hand is None or body is None:
+            self.actuators.arm.late(dt_s)
             # An explicit zero: silence would let the base hold its last command until that expires.
             return [
                 Output(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.0, turn_radps=0.0)),
@@ -106,6 +107,7 @@ class PlanningCore:
         latched = self._estimator.latched()
         if latched:
             self.actuators.grip.keep()
+            self.actuators.arm.resync()
             return self._halt(latched, now_ns)
         self._missing_since_ns = None
         if self._estimator.base is not None and self._estimator.base.stopped_by == NO_COMMAND:
@@ -203,9 +205,8 @@ class PlanningCore:
         return plan
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
-        """Command nothing, so that the hardware stops by itself, and restart later from the measured state. The claws'
-        goals stay: the last ones may have been lost on their way."""
-        self.actuators.arm.resync()
+        """Command nothing, so that the hardware stops by itself. The claws' goals stay: the last ones may have been
+        lost on their way."""
         self.actuators.driver.reset()
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
