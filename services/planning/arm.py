@@ -225,8 +225,9 @@ class ArmController:
         its way, however far ahead the goals are."""
         if self._careful_s <= 0.0:
             return speed_radps
-        gaps = np.abs(goal - self._measured)
-        return np.maximum(gaps * (speed_radps.max() / max(gaps.max(), 1e-6)), _SLOWEST_RADPS)
+        gaps: FloatArray = np.abs(goal - self._measured)
+        together: FloatArray = np.maximum(gaps * (speed_radps.max() / max(gaps.max(), 1e-6)), _SLOWEST_RADPS)
+        return together
 
     def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
         """One step of the named joints to their goals; the others stay."""
