@@ -30,7 +30,7 @@ def test_a_fetch_over_a_link_of_50_ms_that_loses_packets_is_done_and_touches_not
         link = SlowLink(delay_s=0.05, loss=0.02)
         settings = {"sim": SMALL_FRAMES | {"sensors": "real"}}
         async with RobotRig(bus_of=link.bus, clock_of=followed, settings=settings) as rig:
-            judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
+            judge = Judge(rig.robot, find_scene("paper", 0, "red_can"), "red_can")
             rig.operator.on(topics.TRUTH, judge.feed)
             state = await rig.run("fetch", "red_can")
             await rig.advance(HELD_S + 0.5)
