@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cocoro.component import Implementation
-from cocoro.messages import Frame, KnownObject, ObjectsReply, TasksReply
+from cocoro.messages import EstopReply, EstopRequest, Frame, KnownObject, ObjectsReply, ResetRequest, TasksReply
 from cocoro.node import Node
 from cocoro.task_table import described
 from cocoro.testing import ServiceUnderTest
-from cocoro.topics import OBJECTS, TASKS
+from cocoro.topics import ESTOP, OBJECTS, RESET, TASKS
 from services.cockpit.access import Gate, Visitor
 from services.cockpit.access_rules import Role
 from services.cockpit.app import App
@@ -180,6 +180,25 @@ class CockpitRig:
             width=width, height=height, colour=memoryview(colour.tobytes()), depth=memoryview(depth.tobytes()),
             stamp_ns=self.service.tester.now_ns(),
         )  # fmt: skip
+
+
+def stoppable(rig: CockpitRig, *, silent: tuple[str, ...] = ()) -> list[str]:
+    """Has base, arm and hand answer stops, and live; returns who stopped them, as they come."""
+    asked: list[str] = []
+    for service in ("base", "arm", "hand"):
+
+        async def stop(question: EstopRequest, service: str = service) -> EstopReply:
+            asked.append(question.by)
+            return EstopReply(service=service, latch="latched")
+
+        async def reset(_: ResetRequest, service: str = service) -> EstopReply:
+            return EstopReply(service=service, latch="released")
+
+        if service not in silent:
+            rig.service.serve(ESTOP.of(service), stop)
+            rig.service.serve(RESET.of(service), reset)
+    rig.service.others_live("base", "arm", "hand")
+    return asked
 
 
 @asynccontextmanager

@@ -24,7 +24,7 @@ from cocoro.bus import shared
 from cocoro.robot import Robot
 from sim.render import Renderer
 
-pytest_plugins = ["clock_rig", "run_record", "run_spread", "tiers"]
+pytest_plugins = ["clock_rig", "page_rig", "run_record", "run_spread", "tiers"]
 
 # Every run draws the same examples, and no example fails because the machine is busy.
 settings.register_profile(

@@ -8,21 +8,14 @@ import zlib
 from pathlib import Path
 
 import pytest
-from cockpit_rig import CockpitRig, cockpit
+from cockpit_rig import cockpit, stoppable
 
 from cocoro.errors import CocoroError
 from cocoro.messages import (
     BaseState,
-    CancelRequest,
-    DriveReply,
-    DriveRequest,
-    EstopReply,
-    EstopRequest,
     FloorPlan,
     Latch,
-    Motion,
     PlannerStatus,
-    ResetRequest,
     TargetEstimate,
     TaskReply,
     TaskRequest,
@@ -31,13 +24,9 @@ from cocoro.messages import (
 from cocoro.testing import in_virtual_time, misdeclared
 from cocoro.topics import (
     BASE_STATE,
-    CANCEL,
-    DRIVE,
-    ESTOP,
     FLOOR_PLAN,
     LATCH,
     PLAN,
-    RESET,
     RUN,
     TASK,
     TOPICS,
@@ -45,25 +34,6 @@ from cocoro.topics import (
 from services.cockpit.component import COCKPIT
 
 BASE = BaseState(odometry_m=(0.0, 0.0), odometry_yaw_rad=0.0, speed_mps=0.2, turn_rate_radps=0.0, bump_left=True)
-
-
-def stoppable(rig: CockpitRig, *, silent: tuple[str, ...] = ()) -> list[str]:
-    """Has base, arm and hand answer stops, and live; returns who stopped them, as they come."""
-    asked: list[str] = []
-    for service in ("base", "arm", "hand"):
-
-        async def stop(question: EstopRequest, service: str = service) -> EstopReply:
-            asked.append(question.by)
-            return EstopReply(service=service, latch="latched")
-
-        async def reset(_: ResetRequest, service: str = service) -> EstopReply:
-            return EstopReply(service=service, latch="released")
-
-        if service not in silent:
-            rig.service.serve(ESTOP.of(service), stop)
-            rig.service.serve(RESET.of(service), reset)
-    rig.service.others_live("base", "arm", "hand")
-    return asked
 
 
 # --- looking --------------------------------------------------------------------------------------
@@ -267,148 +237,6 @@ async def test_a_page_that_asks_too_much_at_once_is_refused_and_still_stops(tmp_
             page.say("run", id=number, task={"task": "park"})
         assert (await page.asks("stop"))["ok"]
         assert [reply["id"] for reply in page.of("reply") if "under way" in reply["text"]] == [8, 9, 10, 11]
-
-
-# --- stopping -------------------------------------------------------------------------------------
-
-
-@in_virtual_time
-async def test_every_page_is_told_of_a_stop_and_who_acknowledged_it(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page, rig.page() as other:
-        stoppable(rig)
-        reply = await page.asks("stop")
-        assert reply["ok"]
-        for each in (page, other):
-            last = each.of("stopped")[-1]
-            assert (last["final"], last["acknowledged"], last["missing"]) == (True, ["base", "arm", "hand"], [])
-            assert last["by"] == "tester"
-
-
-@in_virtual_time
-async def test_who_lives_and_does_not_acknowledge_a_stop_is_named(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page:
-        stoppable(rig, silent=("arm",))
-        reply = await page.asks("stop")
-        assert not reply["ok"]
-        assert page.of("stopped")[-1]["missing"] == ["arm"]
-        assert "NOT ACKNOWLEDGED by arm" in reply["text"]
-
-
-@in_virtual_time
-async def test_a_script_stops_the_robot_by_http(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig:
-        asked = stoppable(rig)
-        answer = await rig.request("POST", "/stop")
-        assert (answer.status, answer.json["ok"]) == (200, True)
-        assert answer.json["acknowledged"] == ["base", "arm", "hand"]
-        assert len(asked) == 3
-        assert (await rig.request("GET", "/stop")).status == 405
-
-
-@in_virtual_time
-async def test_a_stop_of_a_robot_of_which_nothing_lives_is_no_success(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig:
-        answer = await rig.request("POST", "/stop")
-        assert (answer.status, answer.json["ok"]) == (502, False)
-
-
-@in_virtual_time
-async def test_a_reset_asks_the_executive_first_and_gives_its_refusal(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page:
-        stoppable(rig)
-        answers = [EstopReply(service="executive", latch="latched", text="a servo is overloaded")]
-
-        async def reset(_: ResetRequest) -> EstopReply:
-            return answers[0]
-
-        rig.service.serve(RESET.of("executive"), reset)
-        reply = await page.asks("reset")
-        assert not reply["ok"]
-        assert "a servo is overloaded" in reply["text"]
-        answers[0] = EstopReply(service="executive", latch="released")
-        assert (await page.asks("reset"))["data"]["released"] == ["arm", "base", "hand"]
-
-
-# --- driving by hand ------------------------------------------------------------------------------
-
-
-@in_virtual_time
-async def test_a_page_that_drives_quotes_the_ticks_itself(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page:
-        asked: list[DriveRequest] = []
-
-        async def run(_: TaskRequest) -> TaskReply:
-            return TaskReply(accepted=True, task_id="drive-1")
-
-        async def drive(request: DriveRequest) -> DriveReply:
-            asked.append(request)
-            return DriveReply(accepted=request.tick > 0, tick=len(asked), refusal=None if request.tick else "no_tick")
-
-        async def cancel(request: CancelRequest) -> TaskReply:
-            return TaskReply(accepted=True, task_id=request.task_id)
-
-        rig.service.serve(RUN, run)
-        rig.service.serve(DRIVE, drive)
-        rig.service.serve(CANCEL, cancel)
-        assert (await page.asks("begin-drive", instead=True))["ok"]
-        await rig.service.advance(0.05)
-        assert page.of("tick")[-1]["tick"] == 1
-        page.say("drive", tick=1, motion={"speed_mps": 0.3})
-        await rig.service.advance(0.05)
-        assert (asked[1].task_id, asked[1].tick, asked[1].motion) == ("drive-1", 1, Motion(speed_mps=0.3))
-        assert (page.of("tick")[-1]["tick"], page.of("tick")[-1]["accepted"]) == (2, True)
-        await rig.service.advance(5.0)
-        assert len(asked) == 2  # nothing is repeated for the page
-        assert (await page.asks("end-drive"))["data"]["task_id"] == "drive-1"
-
-
-@in_virtual_time
-async def test_a_page_that_goes_ends_the_drive_that_it_began(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig:
-        ended: list[str] = []
-
-        async def run(_: TaskRequest) -> TaskReply:
-            return TaskReply(accepted=True, task_id="drive-1")
-
-        async def cancel(request: CancelRequest) -> TaskReply:
-            ended.append(request.task_id)
-            return TaskReply(accepted=True, task_id=request.task_id)
-
-        rig.service.serve(RUN, run)
-        rig.service.serve(CANCEL, cancel)
-        async with rig.page() as page, rig.page():
-            assert (await page.asks("begin-drive"))["ok"]
-            assert ended == []
-        await rig.service.advance(0.1)
-        assert ended == ["drive-1"]
-
-
-@in_virtual_time
-async def test_motions_that_wait_are_replaced_by_the_newest(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page:
-        asked: list[float] = []
-
-        async def drive(request: DriveRequest) -> DriveReply:
-            asked.append(request.motion.speed_mps)
-            await asyncio.sleep(0.3)
-            return DriveReply(accepted=True, tick=5)
-
-        rig.service.serve(DRIVE, drive)
-        rig.service.feed(TASK, TaskState(task_id="drive-1", task="drive", phase="drive"))
-        await rig.service.advance(0.2)
-        for number in range(1, 7):
-            page.say("drive", tick=1, motion={"speed_mps": number / 10})
-            await rig.service.advance(0.01)
-        await rig.service.advance(1.0)
-        assert asked == [0.1, 0.6]
-
-
-@in_virtual_time
-async def test_a_motion_without_a_drive_is_refused(tmp_path: Path) -> None:
-    async with cockpit(tmp_path) as rig, rig.page() as page:
-        page.say("drive", tick=1, motion={"speed_mps": 0.3})
-        await rig.service.advance(0.1)
-        assert page.of("tick")[-1]["refusal"] == "no_task"
 
 
 # --- pointing -------------------------------------------------------------------------------------

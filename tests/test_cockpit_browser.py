@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 import pytest
-from browser_rig import DRIVING, browser, opened
+from browser_rig import DRIVING, opened
 from faults_live import PROCESSES, LiveRobot, live
 from operator_shell import PATIENCE_S
 from playwright.sync_api import Browser, Error, Page, expect
@@ -86,12 +86,6 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    with browser() as started:
-        yield started
 
 
 @pytest.fixture

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser_rig import DRIVING, SIZES, at_the_middle_of, browser, opened, unfit
+from browser_rig import DRIVING, SIZES, at_the_middle_of, opened, unfit
 from cockpit_fake import PAGE, FakeCockpit
 from playwright.sync_api import Browser, Page, expect
 
@@ -33,24 +32,6 @@ TOO_SOON = """() => {
     watch.observe(release, { attributes: true });
 }"""
 """Releases the robot in the moment in which that can be done."""
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    with browser() as started:
-        yield started
-
-
-@pytest.fixture
-def fake() -> Iterator[FakeCockpit]:
-    with FakeCockpit() as served:
-        yield served
-
-
-@pytest.fixture
-def page(chromium: Browser, fake: FakeCockpit) -> Iterator[Page]:
-    with opened(chromium, fake.url) as shown:
-        yield shown
 
 
 def place_of(page: Page, fake: FakeCockpit, label: str) -> dict[str, float]:

@@ -3,32 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import pytest
-from browser_rig import DRIVING, browser, middle_of, opened
+from browser_rig import DRIVING, middle_of, opened
 from cockpit_fake import FakeCockpit
 from playwright.sync_api import Browser, Page, expect
 
 pytestmark = [pytest.mark.process, pytest.mark.zenoh]
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    with browser() as started:
-        yield started
-
-
-@pytest.fixture
-def fake() -> Iterator[FakeCockpit]:
-    with FakeCockpit() as served:
-        yield served
-
-
-@pytest.fixture
-def page(chromium: Browser, fake: FakeCockpit) -> Iterator[Page]:
-    with opened(chromium, fake.url) as shown:
-        yield shown
 
 
 def motions(fake: FakeCockpit) -> list[dict[str, float]]:

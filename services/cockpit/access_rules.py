@@ -169,6 +169,6 @@ def security_headers(host: str, *, tls: bool) -> list[tuple[bytes, bytes]]:
         "cross-origin-opener-policy": "same-origin",
         "cross-origin-resource-policy": "same-origin",
         "cross-origin-embedder-policy": "require-corp",
-        "permissions-policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), serial=(), bluetooth=()",
+        "permissions-policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), serial=()",
     }
     return [(name.encode(), value.encode()) for name, value in rows.items()]
