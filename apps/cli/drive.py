@@ -33,7 +33,7 @@ HAND_MPS, ROUND_RADPS, ROLL_RADPS = 0.10, 0.3, 0.8
 END_S = 5.0
 """Wait for the end of the task after the command's own."""
 HELP = """\
-hold a key to move, let go to stand:
+hold a key to move, let go to stand (it moves for 0.2 s, and on from when the keyboard repeats the key):
   w s  arrows  ahead, back        a d  turn left, right      A D  ahead in an arc
   i k j l      head up, down, left, right
   t g r f z x  hand out, in, up, down, left, right           v b  roll the wrist
@@ -60,7 +60,9 @@ def drive(
 ) -> None:
     """Drive by hand with the keys of this terminal: base, head, arm and claws.
 
-    A key moves the robot for 0.2 s, and for as long as it repeats. The robot keeps off what it knows of.
+    A key moves the robot for 0.2 s, and for as long as the keyboard repeats it. Keyboards wait before the first
+    repetition, 0.25 to 0.7 s by their settings, so the robot pauses after its first 0.2 s. It keeps off what it
+    knows of.
     """
     if not sys.stdin.isatty():
         raise ConfigError("`cocoro drive` reads single keys: run it in a terminal")
