@@ -65,6 +65,27 @@ async def test_a_page_gets_fifteen_pictures_a_second_of_a_camera_that_makes_thir
         assert image.shape == (240, 320, 3)
 
 
+@in_virtual_time
+async def test_the_rate_is_the_asked_one_though_the_camera_has_no_frames_at_these_times(tmp_path: Path) -> None:
+    async with cockpit(tmp_path, fps=20) as rig, rig.page() as page:
+        await rig.service.advance(0.1)
+        await film(rig, 3.0)
+        assert len(page.pictures) == pytest.approx(60, abs=2)
+
+
+@in_virtual_time
+async def test_a_page_that_is_late_at_times_gets_as_many_pictures_as_others(tmp_path: Path) -> None:
+    async with cockpit(tmp_path) as rig, rig.page() as page:
+        await rig.service.advance(0.1)
+        for _ in range(20):
+            await film(rig, 6 / CAMERA_HZ)
+            page.acknowledges = False
+            await film(rig, 3 / CAMERA_HZ)
+            page.say("seen", stamp_ns=page.pictures[-1]["stamp_ns"])
+            page.acknowledges = True
+        assert len(page.pictures) == pytest.approx(90, abs=3)
+
+
 def test_five_pages_share_each_encoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @in_virtual_time
     async def tried() -> None:

@@ -27,8 +27,8 @@ LATE_S = 0.1
 """A picture may take this much longer than the network's least time, from its sending to the page's acknowledgement."""
 LOST_S = 3.0
 """A picture that is not acknowledged after this counts as lost; then one more is sent."""
-EARLY = 0.6
-"""A frame counts as due when this share of a period has passed: the camera's frames do not come at our times."""
+EARLY = 0.25
+"""A frame counts as due so many periods before its time: the camera's frames do not come at our times."""
 NICER = 10
 """What the encoding thread yields to the others of this machine, in steps of niceness."""
 _LENGTH = struct.Struct("<I")
@@ -106,7 +106,8 @@ class Pictures:
         self._marks = marks
         self._now_ns = now_ns
         self._thread = ThreadPoolExecutor(1, "pictures", _yield) if threaded else None
-        self._offered_ns: int | None = None
+        self._due_ns: int | None = None
+        """When the next picture is due, by the frames' stamps."""
         self._busy = False
         self.encoded = 0
         """Pictures that were encoded, for whomever."""
@@ -119,16 +120,23 @@ class Pictures:
         wanting = [viewer for viewer in viewers if viewer.looking.wants(now_s)]
         if not wanting:
             return None
-        self._offered_ns = frame.stamp_ns
+        self._plan(frame.stamp_ns)
         self._busy = True
         for viewer in wanting:
             viewer.looking.sent(frame.stamp_ns, now_s)
         return asyncio.ensure_future(self._encode(frame, wanting))
 
     def _due(self, stamp_ns: int) -> bool:
-        if self._offered_ns is None or stamp_ns < self._offered_ns:  # nothing yet, or a clock that jumped back
+        if self._due_ns is None or stamp_ns < self._due_ns - 2 * self._period_ns:  # nothing yet, or a clock jumped back
             return True
-        return stamp_ns - self._offered_ns >= EARLY * self._period_ns
+        return stamp_ns >= self._due_ns - EARLY * self._period_ns
+
+    def _plan(self, stamp_ns: int) -> None:
+        """A frame was taken. The next one is due a period after this one was due, so that a viewer who was not ready in
+        time makes one picture late, and none the fewer."""
+        due_ns = stamp_ns if self._due_ns is None else self._due_ns
+        latest_ns = stamp_ns + round(EARLY * self._period_ns)
+        self._due_ns = min(max(due_ns, stamp_ns - self._period_ns), latest_ns) + self._period_ns
 
     async def _encode(self, frame: Frame, wanting: list[Viewing]) -> None:
         groups: dict[Level, list[Viewing]] = {}
