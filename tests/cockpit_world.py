@@ -258,9 +258,9 @@ class World:
             "state": "running",
             "body": [self.x_m, self.y_m, self.yaw_rad],
             "hand": [0.2, 0.0, 0.3],
-            "holding": False,
+            "holding": self.task.get("task") == "fetch" and self.task["outcome"] == "done",
             "known": known,
-            "target": self.task.get("label") or None,
+            "target": (self.task.get("label") or None) if self.running else None,
         }
 
     def state(self) -> dict[str, Any]:

@@ -93,6 +93,15 @@ def test_a_click_on_a_can_offers_what_can_be_done_with_it(page: Page, fake: Fake
     expect(page.locator("#now-task")).to_have_text("Fetch red can")
 
 
+def test_what_was_fetched_is_said_to_be_in_the_hand(page: Page, fake: FakeCockpit) -> None:
+    page.click("#objects button:has-text('green can')")
+    page.click("#tasks button:has-text('Fetch green can')")
+    fake.until(lambda: fake.world.running)
+    fake.world.end("done")
+    expect(page.locator("#now-why")).to_have_text("In the hand: green can.")
+    expect(page.locator("#objects button:has-text('green can') small")).to_have_text("in the hand")
+
+
 def test_a_click_on_the_map_sends_the_robot_there(page: Page, fake: FakeCockpit) -> None:
     box = page.locator("#map").bounding_box()
     assert box is not None

@@ -2,6 +2,7 @@
 import { make, mark, the, write } from "./dom.js";
 import { announce } from "./said.js";
 import { title } from "./tasks.js";
+import { held } from "./objects.js";
 import { called, metres, say, span } from "./words.js";
 
 let told = "";
@@ -14,7 +15,7 @@ export function showNow(state, mayCancel) {
   write(the("now-task"), task?.task_id ? outcome(task) : say("now.idle"));
   const phase = runs ? [called("phase", task.phase), task.distance_m != null ? metres(task.distance_m) : "", span(task.elapsed_s ?? 0)] : [];
   steps(the("now-phases"), runs ? (task.phases ?? []).length : 0, phase.filter(Boolean).join(" · "));
-  write(the("now-why"), (runs ? plan?.why || task.text : sentence(task?.reason) || plan?.why) || say("now.stands"));
+  write(the("now-why"), (runs ? plan?.why || task.text : sentence(task?.reason) || holds(state) || plan?.why) || say("now.stands"));
   mark(the("now-task"), "class", runs ? null : { done: "good", failed: "bad", stopped: "warn" }[ending(task)]);
   const news = task?.task_id ? `${title(task)}: ${runs ? called("phase", task.phase) : say(`outcome.${ending(task)}`)}` : "";
   if (news && news !== told) announce(news);
@@ -28,6 +29,12 @@ function outcome(task) {
 /** How a task ended; one that failed because of the emergency stop was stopped. */
 function ending(task) {
   return task?.reason?.startsWith("estop") ? "stopped" : task?.outcome;
+}
+
+/** What is in the hand, as a sentence; "" for nothing. */
+function holds(state) {
+  const label = held(state);
+  return label === null ? "" : label ? say("now.holds", { object: called("object", label) }) : say("now.holds_something");
 }
 
 /** A reason without the word for programs before it. */

@@ -5,6 +5,12 @@ const SHADES = {
 }; // prettier-ignore
 const SVG = "http://www.w3.org/2000/svg";
 
+/** The label of what is in the hand by a message `state`; "" where nobody knows its label, null where nothing is there. */
+export function held({ task, plan }) {
+  if (!plan?.holding) return null;
+  return plan.target ?? (task?.task === "fetch" && task.outcome === "done" ? task.label : "");
+}
+
 /** The colour in an object's name; null without one. */
 export function shade(label) {
   const word = label.split(/[-_ ]/).find((part) => part in SHADES);

@@ -1,6 +1,6 @@
 // Objects and tasks to choose from, built from what the server says there is: a task of a third party appears, too.
 import { make, mark, the, write } from "./dom.js";
-import { swatch } from "./objects.js";
+import { held, swatch } from "./objects.js";
 import { accepted, announce, notice } from "./said.js";
 import { called, metres, say, span } from "./words.js";
 
@@ -119,7 +119,7 @@ export class Tasks {
 
   #where(label) {
     const plan = this.state.plan;
-    if (plan?.holding && plan.target === label) return say("where.held");
+    if (held(this.state) === label) return say("where.held");
     const seen = (plan?.known ?? []).find((item) => item.label === label);
     if (!seen) return say(this.inView.includes(label) ? "where.in_view" : "where.never");
     const away = plan.body ? metres(Math.hypot(seen.x - plan.body[0], seen.y - plan.body[1])) : "";
@@ -130,7 +130,7 @@ export class Tasks {
   #button(task) {
     const begin = () => this.run({ task: task.name, ...(task.label ? { label: this.chosen } : {}) });
     const main = task.name === MAIN && task.label;
-    const name = make("span", {}, called("task", task.name));
+    const name = make("span", {}, main ? title({ task: task.name, label: this.chosen }) : called("task", task.name));
     const button = make("button", { type: "button", class: `task${main ? " first" : ""}`, onclick: begin }, name);
     const options = task.options.filter((option) => !PLACE.includes(option.name));
     if (options.length === 0) return button;
