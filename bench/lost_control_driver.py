@@ -1,9 +1,9 @@
 """The driver that `bench.lost_control` loses: `python -m bench.lost_control_driver ROBOT FILE`.
 
-Asks the robot for the task `drive`, turns round, and drives ahead at full speed. Appends to FILE the time
-(CLOCK_MONOTONIC, ns, 8 bytes) at which each request was sent whose motion was accepted. A line on standard input ends
-that: `freeze` stops asking as a frozen program does, `let-go` asks for rest. Standard error tells why the robot does
-what it does.
+Waits for a line on standard input; then asks the robot for the task `drive`, turns round, and drives ahead at full
+speed. Appends to FILE the time (CLOCK_MONOTONIC, ns, 8 bytes) at which each request was sent whose motion was
+accepted. The next line ends that: `freeze` stops asking as a frozen program does, `let-go` asks for rest. Standard
+error tells why the robot does what it does.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ async def _task(link: MeshLink, asker: str) -> str:
     async with asyncio.timeout(PATIENCE_S):
         while True:
             try:
-                reply = await begin(link, asker=asker)
+                reply = await begin(link, asker=asker, instead=True)
                 if reply.accepted:
                     return reply.task_id
                 print(reply.text, file=sys.stderr)
@@ -64,8 +64,10 @@ async def _task(link: MeshLink, asker: str) -> str:
 
 
 async def main(robot: str, file: Path) -> None:
-    """Drive until a line says what else to do, and for ever then."""
-    said = asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline)
+    """Drive from the first line on until the next one says what else to do, and for ever then."""
+    loop = asyncio.get_running_loop()
+    await loop.run_in_executor(None, sys.stdin.readline)
+    said = loop.run_in_executor(None, sys.stdin.readline)
     async with joined(RobotChoice(robot, None)) as link:
         asker = f"driver-{os.getpid()}"
         link.bus.declare_alive(asker_key(link.robot, asker))

@@ -1,8 +1,9 @@
-"""The page that `bench.lost_control` loses: `python -m bench.lost_control_page PORT FILE`.
+"""The page that `bench.lost_control` loses: `python -m bench.lost_control_page ROBOT FILE`.
 
-Drives as `bench.lost_control_driver` does, over the cockpit's WebSocket: takes the robot, turns round, and drives ahead
-at full speed. The time in FILE is that of each message that was sent whose motion was accepted. `freeze` on standard
-input is a page that sends nothing any more and keeps its socket, `let-go` asks for rest.
+Drives as `bench.lost_control_driver` does, over the cockpit's WebSocket, whose port is the first line of its standard
+input: takes the robot, turns round, and drives ahead at full speed. The time in FILE is that of each message that was
+sent whose motion was accepted. A line `freeze` is a page that sends nothing any more and keeps its socket, `let-go`
+asks for rest.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class DrivingPage:
         """Take the robot. Raises TimeoutError."""
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s:
-            self.say("begin-drive", id=next(self._ids))
+            self.say("begin-drive", id=next(self._ids), instead=True)
             reply = self._until(lambda message: message["kind"] == "reply")
             if reply["ok"]:
                 return
@@ -68,8 +69,8 @@ class DrivingPage:
 
 
 def main() -> None:
-    """Drive until a line says what else to do, and for ever then."""
-    with opened(int(sys.argv[1])) as socket:
+    """Drive from the first line on until the next one says what else to do, and for ever then."""
+    with opened(int(sys.stdin.readline())) as socket:
         page = DrivingPage(socket, Path(sys.argv[2]))
         page.say("pictures", on=False)
         page.begin()
