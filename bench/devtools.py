@@ -69,9 +69,10 @@ class Chromium:
 
     def tell(self, session: str, method: str, **params: Any) -> int:
         """Send a command without waiting for its answer; returns its number."""
-        message = {"id": next(self._ids), "method": method, "params": params}
+        number = next(self._ids)
+        message = {"id": number, "method": method, "params": params}
         self._socket.send(json.dumps(message | ({"sessionId": session} if session else {})))
-        return int(message["id"])  # type: ignore[call-overload]
+        return number
 
     def call(self, session: str, method: str, **params: Any) -> dict[str, Any]:
         """Send a command; returns its result. Raises CocoroError when it fails, or nothing comes."""

@@ -37,6 +37,8 @@ BODY, BRAIN, DESK = "body", "brain", "desk"
 """The hosts; at the desk sit the persons."""
 PERSONS: dict[str, Role] = {"ada": "operator", "eve": "viewer", "bob": "author"}
 PORT = 7447
+COCKPIT_PORT = 8770
+"""Of the cockpit, where it is among the processes of the robot's host; then it is open to the other hosts."""
 COMMAND_S = 120.0
 BRAINS = ("perception", "planning", "executive")
 FRAMES: dict[str, Any] = {"width": 320, "height": 240, "frame_rate_hz": 15.0}
@@ -50,6 +52,7 @@ def files_of(address: str, sim: Mapping[str, Any], processes: Sequence[str] = ("
         "profile.toml": (
             f'robot = "{ROBOT}"\nclock = "sim"\nprocesses = {json.dumps([*processes, *BRAINS])}\n'
             f"[service.sim]\n{settings}[service.capture]\nkeep_gb = 2.0\n"
+            f'[service.cockpit]\nhost = "{address}"\nport = {COCKPIT_PORT}\n'
         ),
         place.PLAN: (
             f'name = "lab"\n[robot.{ROBOT}]\nprofile = "profile.toml"\n'
