@@ -60,6 +60,7 @@ ENTRIES: dict[str, Entry] = {
     "clocks": Entry("clocks"),
     "cockpit-hostile": Entry("cockpit_hostile"),
     "cockpit-network": Entry("cockpit_network"),
+    "cockpit-newcomer": Entry("cockpit_newcomer"),
     "cockpit-pictures": Entry("cockpit_pictures"),
     "cockpit-screen": Entry("cockpit_screen"),
     "cockpit-stop": Entry("cockpit_stop"),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -32,8 +34,9 @@ class Driver:
         self._end_s = END_S[kind]
         command = [sys.executable, "-m", f"bench.lost_control_{MODULES[kind]}", NAME, str(sent)]
         self._process = subprocess.Popen(
-            command, env=cocoro.environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+            command, env=cocoro.environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,
+        )  # fmt: skip
 
     def go(self, port: int) -> None:
         """Let it drive. `port`: of the cockpit."""
@@ -59,12 +62,12 @@ class Driver:
         return int(SENT.unpack_from(data, whole - SENT.size)[0]) if whole else 0
 
     def end(self) -> str:
-        """End it; returns the end of what it said."""
-        try:
-            said = self._process.communicate(timeout=self._end_s)[1]  # the end of its input lets a browser end in order
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            said = self._process.communicate()[1]
+        """End it, with its browser; returns the end of what it said."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.communicate(timeout=self._end_s)  # the end of its input lets a browser end in order
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        said = self._process.communicate()[1]
         return said[-300:].replace("\n", " ")
 
 
