@@ -100,12 +100,12 @@ class TurningPage:
 
     def begin(self) -> None:
         """Release the robot and take it. Raises CocoroError when it is not to be had."""
-        self._asked({"do": "reset"})
         deadline_s = time.monotonic() + PATIENCE_S
-        while not self._asked({"do": "begin-drive"}, may_fail=True):
-            if time.monotonic() > deadline_s:
-                raise CocoroError("the robot is not to be had")
-            time.sleep(0.2)
+        for do in ("reset", "begin-drive"):
+            while not self._asked({"do": do}):
+                if time.monotonic() > deadline_s:
+                    raise CocoroError(f"{do}: the robot is not to be had")
+                time.sleep(0.2)
 
     def turn(self, over: Callable[[float], bool]) -> None:
         """Turn at full rate until `over` is true of the time since the robot turns, s. Raises CocoroError when it does
@@ -136,13 +136,11 @@ class TurningPage:
         """Whether the robot turns, by its newest state."""
         return abs(self._speed_radps) > FULL_SHARE * TURN_RADPS
 
-    def _asked(self, order: dict[str, Any], *, may_fail: bool = False) -> bool:
+    def _asked(self, order: dict[str, Any]) -> bool:
+        """Whether a request was carried out."""
         id = next(self._ids)
         self.say({**order, "id": id})
-        reply = self._until(lambda message: message["kind"] == "reply" and message["id"] == id)
-        if not reply["ok"] and not may_fail:
-            raise CocoroError(f"{order['do']}: {reply['text']}")
-        return bool(reply["ok"])
+        return bool(self._until(lambda message: message["kind"] == "reply" and message["id"] == id)["ok"])
 
     def _until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         deadline_s = time.monotonic() + PATIENCE_S

@@ -93,6 +93,12 @@ def test_a_click_on_a_can_offers_what_can_be_done_with_it(page: Page, fake: Fake
     expect(page.locator("#now-task")).to_have_text("Fetch red can")
 
 
+def test_a_newcomer_is_told_what_to_do_first(page: Page, fake: FakeCockpit) -> None:
+    expect(page.locator("#now-task")).to_have_text("Ready")
+    expect(page.locator("#now-why")).to_contain_text("Choose an object")
+    expect(page.locator("#tasks .first").first).to_have_text("Fetch red can")
+
+
 def test_what_was_fetched_is_said_to_be_in_the_hand(page: Page, fake: FakeCockpit) -> None:
     page.click("#objects button:has-text('green can')")
     page.click("#tasks button:has-text('Fetch green can')")

@@ -15,7 +15,9 @@ export function showNow(state, mayCancel) {
   write(the("now-task"), task?.task_id ? outcome(task) : say("now.idle"));
   const phase = runs ? [called("phase", task.phase), task.distance_m != null ? metres(task.distance_m) : "", span(task.elapsed_s ?? 0)] : [];
   steps(the("now-phases"), runs ? (task.phases ?? []).length : 0, phase.filter(Boolean).join(" · "));
-  write(the("now-why"), (runs ? plan?.why || task.text : sentence(task?.reason) || holds(state) || plan?.why) || say("now.stands"));
+  const invites = !task?.task_id && mayCancel && state.latch !== "latched";
+  const rest = () => sentence(task?.reason) || holds(state) || (invites ? say("now.invites") : plan?.why);
+  write(the("now-why"), (runs ? plan?.why || task.text : rest()) || say("now.stands"));
   mark(the("now-task"), "class", runs ? null : { done: "good", failed: "bad", stopped: "warn" }[ending(task)]);
   const news = task?.task_id ? `${title(task)}: ${runs ? called("phase", task.phase) : say(`outcome.${ending(task)}`)}` : "";
   if (news && news !== told) announce(news);
