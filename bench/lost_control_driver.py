@@ -19,9 +19,9 @@ from apps.cli.link import MeshLink, joined
 from apps.client.choice import RobotChoice
 from cocoro.driving import Driving, begin
 from cocoro.errors import CocoroError
+from cocoro.keys import asker_key
 from cocoro.messages import Motion
 from cocoro.topics import PLAN
-from services.executive.askers import asker_key
 
 SENT = struct.Struct("<q")
 TURN_S = 2.2

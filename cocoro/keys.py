@@ -19,6 +19,11 @@ def recorder_key(robot: str, service: str = "*") -> str:
     return f"{robot}/{service}/recorder"
 
 
+def asker_key(robot: str, asker: str = "*") -> str:
+    """The liveliness token of an asker, declared before the request and dropped when he has gone; by default of all."""
+    return f"{robot}/{asker}/asker"
+
+
 def service_of(key: str) -> str:
     """The service in a key `<robot>/<service>/...`; empty for a key of one chunk."""
     return key.partition("/")[2].partition("/")[0]

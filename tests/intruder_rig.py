@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 from bench.site_lab import BRAIN, ROBOT, files_of
 from cocoro.installed import all_requests, all_topics
-from cocoro.keys import alive_key, matches, recorder_key
+from cocoro.keys import alive_key, asker_key, matches, recorder_key
 from cocoro.topics import Request, Topic
 from deploy.site import plan
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
-from services.executive.askers import asker_key
 
 PRINCIPALS = ("eve", "ada", "bob", BRAIN)
 """A viewer, an operator, an author, and who has stolen the brain's certificate."""

@@ -12,10 +12,10 @@ from apps.cli import exits
 from apps.cli.babble import SampleWriter
 from apps.cli.progress import LineDisplay
 from apps.cli.tasks import Follower
+from cocoro.keys import asker_key
 from cocoro.messages import (
     Message,
 )
-from services.executive.askers import asker_key
 
 
 class Vanished(LineDisplay):

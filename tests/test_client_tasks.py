@@ -15,12 +15,12 @@ from apps.client.handle import TaskHandle
 from apps.client.robot import RobotClient
 from cocoro.clock import VirtualClock
 from cocoro.errors import ConfigError, MeshError
+from cocoro.keys import asker_key
 from cocoro.messages import Recording, RefusalCode, TaskReply, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.task_errors import REFUSALS
 from cocoro.topics import RECORDING
-from services.executive.askers import asker_key
 
 
 @asynccontextmanager

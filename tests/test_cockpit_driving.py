@@ -7,6 +7,7 @@ from pathlib import Path
 
 from cockpit_rig import cockpit
 
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest, DriveReply, DriveRequest, Motion, TaskReply, TaskRequest, TaskState
 from cocoro.testing import in_virtual_time
 from cocoro.topics import CANCEL, DRIVE, RUN, TASK
@@ -40,6 +41,26 @@ async def test_a_page_that_drives_quotes_the_ticks_itself(tmp_path: Path) -> Non
         await rig.service.advance(5.0)
         assert len(asked) == 2  # nothing is repeated for the page
         assert (await page.asks("end-drive"))["data"]["task_id"] == "drive-1"
+
+
+@in_virtual_time
+async def test_the_drive_ends_with_the_cockpit_however_that_ends_and_other_tasks_do_not(tmp_path: Path) -> None:
+    async with cockpit(tmp_path) as rig:
+        asked: list[TaskRequest] = []
+        alive: dict[str, bool] = {}
+
+        async def run(request: TaskRequest) -> TaskReply:
+            asked.append(request)
+            return TaskReply(accepted=True, task_id="t1")
+
+        rig.service.serve(RUN, run)
+        rig.service.tester.bus.watch_alive(asker_key("calliope"), alive.__setitem__)
+        async with rig.page() as page:
+            assert (await page.asks("begin-drive"))["ok"]
+            assert (await page.asks("run", task={"task": "park"}))["ok"]
+        assert [request.asker for request in asked] == ["cockpit", ""]
+        assert alive == {asker_key("calliope", "cockpit"): True}
+    assert alive == {asker_key("calliope", "cockpit"): False}
 
 
 @in_virtual_time

@@ -11,10 +11,10 @@ from executive_rig import Robot, idle_again, robot
 from cocoro import topics
 from cocoro.contact import Contact
 from cocoro.driving import Driving
+from cocoro.keys import asker_key
 from cocoro.messages import DriveReply, DriveRequest, Motion
 from cocoro.messages.driving import HOLD_S
 from cocoro.testing import JumpingClock, in_virtual_time
-from services.executive.askers import asker_key
 from services.executive.tasks.drive import LEFT_ALONE_S
 
 AHEAD = Motion(speed_mps=0.3)

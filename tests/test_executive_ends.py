@@ -11,12 +11,12 @@ from executive_rig import idle_again, robot
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.held_file import hold
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest, ReportRequest, TaskState
 from cocoro.testing import JumpingClock, in_virtual_time
 from deploy.contact import ProcessContact, SleepDetector
 from deploy.processes import hardware
 from deploy.rundir import RunDir
-from services.executive.askers import asker_key
 from services.executive.tasks import ParkTask
 
 

@@ -12,13 +12,13 @@ from spelled import action
 
 from cocoro import topics
 from cocoro.held_file import HeldFile
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest
 from cocoro.messages.actions import ACTIONS, Action
 from cocoro.testing import in_virtual_time
 from deploy.contact import ProcessContact
 from deploy.processes import hardware
 from deploy.rundir import RunDir
-from services.executive.askers import asker_key
 from services.executive.recovery import Resume, policy, strictest
 
 SERVICES = (*hardware(), "perception", "planning")

@@ -14,9 +14,9 @@ from robot_rig import HALTED_MPS, RobotRig
 from spelled import asked
 
 from cocoro import topics
+from cocoro.keys import asker_key
 from cocoro.messages import TaskState
 from cocoro.testing import in_virtual_time
-from services.executive.askers import asker_key
 
 pytestmark = pytest.mark.sim
 

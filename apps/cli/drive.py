@@ -19,9 +19,9 @@ from apps.cli.terminal import StatusLine
 from apps.client.task_run import ASK_AGAIN_S, UNSETTLED_S
 from cocoro.driving import Driving, begin
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest, Motion, ReportRequest, TaskReply, TaskState
 from cocoro.topics import CANCEL, PLAN, REPORT
-from services.executive.askers import asker_key
 
 SHOW_S = 0.1
 FASTER = 1.25

@@ -131,8 +131,8 @@ class Door:
         finally:
             for way in ways:
                 way.cancel()
+            their_writer.close()  # before the wait, which a door that shuts ends
             await asyncio.gather(*ways, return_exceptions=True)
-            their_writer.close()
 
     def _why_not_them(self, writer: asyncio.StreamWriter) -> str:
         """Why a process is not let through, whatever it asks; '' when it is."""

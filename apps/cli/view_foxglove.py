@@ -29,11 +29,11 @@ from apps.cli.viewed import PER_SERVICE, Waiting, watch
 from apps.client.link import MeshLink, joined, through_site
 from cocoro.bus.base import Handle
 from cocoro.errors import ConfigError, MeshError
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest, EstopRequest, TaskRequest
 from cocoro.topics import CANCEL, ESTOP, RUN, TOPICS
 from deploy.processes import stoppable
 from services.cockpit.access_peer import Peers
-from services.executive.askers import asker_key
 from services.executive.tasks import TASKS
 
 if TYPE_CHECKING:

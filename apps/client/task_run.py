@@ -17,10 +17,10 @@ from cocoro.bus.base import Handle
 from cocoro.contact import Contact
 from cocoro.driving import BEGIN_S
 from cocoro.errors import CallTimeoutError, CocoroError
+from cocoro.keys import asker_key
 from cocoro.messages import CancelRequest, Message, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
 from cocoro.topics import CANCEL, LATCH, RECORDING, RUN, TASK, Topic
-from services.executive.askers import asker_key
 
 __all__ = ["EXECUTIVE", "LostTaskError", "Rejoin", "TaskRun"]
 

@@ -9,12 +9,12 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from cocoro.installed import all_requests, all_topics
-from cocoro.keys import alive_key, matches, recorder_key
+from cocoro.keys import alive_key, asker_key, matches, recorder_key
 from cocoro.node import QUESTION_BYTES
+from cocoro.topics import RUN
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
 from deploy.site.rules import most_hz
-from services.executive.askers import asker_key
 
 TOPIC, REQUEST, TOKEN, OWN = "topic", "request", "token", "author's"
 VERBS = {
@@ -61,12 +61,17 @@ def matrix(site: Site, robot: str) -> list[Row]:
         for key in (
             *(alive_key(robot, service) for service in services),
             *(recorder_key(robot, service) for service in services),
-            asker_key(robot, "asker"),
+            *(asker_key(robot, asker) for asker in (*_askers(site, hosts), "asker")),
         )
     ]
     authors = [name for name in names if site.role(name) == "author"]
     rows += [Row(f"{name}/**", OWN, _may(may, f"{robot}/{name}/any", OWN)) for name in authors]
     return [row for row in rows if any({"puts", "answers", "shows"} & {*verbs} for verbs in row.may.values())]
+
+
+def _askers(site: Site, hosts: list[str]) -> list[str]:
+    """The services that ask for tasks."""
+    return [service for name in hosts for one in site.share(name) if RUN in one.calls for service in one.services]
 
 
 def _nodes(site: Site, host: str) -> list[str]:

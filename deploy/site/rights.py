@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
-from cocoro.keys import alive_key, matches, recorder_key
+from cocoro.keys import alive_key, asker_key, matches, recorder_key
 from cocoro.topics import (
     ABOUT,
     ANY,
@@ -23,6 +23,7 @@ from cocoro.topics import (
     EXCHANGES,
     HEALTH,
     OFFSET,
+    RUN,
     STEPS,
     TIME,
     TOPICS,
@@ -34,7 +35,6 @@ from cocoro.topics import (
 from deploy.site.component import gateway_of
 from deploy.site.plan import Site
 from deploy.site.roles import Role
-from services.executive.askers import asker_key
 
 OF_PERSONS: dict[Role, tuple[Right, ...]] = {
     "viewer": ("see", "stop"),
@@ -110,6 +110,8 @@ def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Right
         hears |= {_any(row).key(robot) for row in component.reads if not row.local}
         asks |= {_any(row).key(robot) for row in component.calls}
         shows |= {alive_key(robot, node) for node in nodes}
+        if RUN in component.calls:
+            shows |= {asker_key(robot, node) for node in nodes}
         if component.records:
             records = True
             hears.add(f"{robot}/**")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cocoro.errors import CocoroError
+from cocoro.keys import asker_key
 from cocoro.messages import (
     CancelRequest,
     ObjectsRequest,
@@ -45,6 +46,7 @@ class Asker:
         self._node = node
         self._alive: set[str] = set()
         self._learnt = False
+        node.keep(node.bus.declare_alive(asker_key(node.robot_name, node.name)))
 
     def lives(self, service: str, alive: bool) -> None:
         """A service became alive, or ceased to be. A new executive may know other tasks."""
@@ -71,9 +73,11 @@ class Asker:
         ]
         self._learnt = True
 
-    async def run(self, task: Mapping[str, Any], *, instead: bool = False) -> Reply:
-        """Start a task; `instead` of the one that runs, once the robot is at rest."""
-        request = TaskRequest(task=dict(task), instead=instead)
+    async def run(self, task: Mapping[str, Any], *, instead: bool = False, with_us: bool = False) -> Reply:
+        """Start a task; `instead` of the one that runs, once the robot is at rest. `with_us`: it ends when this process
+        does, however it ends."""
+        asker = self._node.name if with_us else ""
+        request = TaskRequest(task=dict(task), instead=instead, asker=asker)
         return await self._told(self._node.call(RUN, request, INSTEAD_S if instead else None))
 
     async def cancel(self, task_id: str = "") -> Reply:

@@ -30,7 +30,7 @@ class Driver:
 
     async def begin(self, *, instead: bool) -> Reply:
         """Take the robot. The first tick follows the answer."""
-        reply = await self._cockpit.asker.run({"task": DRIVE_TASK}, instead=instead)
+        reply = await self._cockpit.asker.run({"task": DRIVE_TASK}, instead=instead, with_us=True)
         if reply.ok and reply.data is not None:
             self._task_id = str(reply.data["task_id"])
             self.move(Drive())

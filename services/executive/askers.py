@@ -9,16 +9,11 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 
-from cocoro.keys import service_of
+from cocoro.keys import asker_key, service_of
 from cocoro.node import Node
 
 ARRIVAL_S = 0.5
 """Longest wait for the token of an asker, which may come a moment after his request."""
-
-
-def asker_key(robot: str, asker: str = "*") -> str:
-    """The liveliness token of an asker, declared before the request and dropped when he has gone; by default of all."""
-    return f"{robot}/{asker}/asker"
 
 
 class Askers:
