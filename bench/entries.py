@@ -72,6 +72,7 @@ ENTRIES: dict[str, Entry] = {
     "hardware-faults": Entry("hardware_faults"),
     "idle": Entry("idle"),
     "installs": Entry("installs"),
+    "lerobot": Entry("lerobot"),
     "lost-control": Entry("lost_control"),
     "mend": Entry("mend"),
     "network": Entry("network"),

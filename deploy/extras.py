@@ -11,7 +11,10 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError
 
 PROJECT = "cocoro-mesh"
-EXTRAS = ("operator", "cockpit", "robot", "sim", "site", "view", "tables", "foxglove", "experiments", "bench", "dev")
+EXTRAS = (
+    "operator", "cockpit", "robot", "sim", "site", "view", "tables", "lerobot", "foxglove", "experiments", "bench",
+    "dev",
+)  # fmt: skip
 """The extras, from the smallest on; of several that have a library the first is advised."""
 NEEDED = {"rehearse": "sim", "experiment": "sim"}
 """The extra that a command needs as a whole, so that the first missing library does not lead to the next one."""

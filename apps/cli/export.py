@@ -1,9 +1,9 @@
-"""`cocoro export`: captures as film, table, or scene of another viewer."""
+"""`cocoro export`: captures as film, table, scene of another viewer, or dataset to train with."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ import typer
 from apps.captures.export.files import refuse_existing
 from apps.captures.info import left_out_notes
 from apps.cli import exits
-from apps.cli.options import CameraOption, CaptureArgument, JsonOption
+from apps.cli.options import CameraOption, CapturesArgument, JsonOption
 from apps.cli.output import print_json
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
@@ -26,7 +26,7 @@ app = typer.Typer()
 
 @app.command()
 def export(
-    file: CaptureArgument,
+    files: CapturesArgument,
     video: Annotated[
         Path | None,
         typer.Option(
@@ -43,6 +43,21 @@ def export(
     parquet: Annotated[
         Path | None, typer.Option("--parquet", metavar="DIR", help="The same tables; needs cocoro-mesh[tables].")
     ] = None,
+    lerobot: Annotated[
+        Path | None,
+        typer.Option(
+            "--lerobot",
+            metavar="DIR",
+            help="A LeRobotDataset, an episode for each task of all FILEs, or of those in folders; needs "
+            "cocoro-mesh[lerobot].",
+        ),
+    ] = None,
+    rate_hz: Annotated[
+        int | None,
+        typer.Option(
+            "--fps", min=1, max=1000, metavar="HZ", help="Rate of the LeRobotDataset; by default the camera's."
+        ),
+    ] = None,
     rrd: Annotated[
         Path | None, typer.Option("--rrd", metavar="OUT.rrd", help="For Rerun; needs cocoro-mesh[view].")
     ] = None,
@@ -51,9 +66,17 @@ def export(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
-    at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, camera, json))
+    """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments; or turn captures
+    into a dataset to train with. Several forms at once are possible."""
+    if lerobot is not None:
+        if any((video, rrd, foxglove, csv, parquet, attachments)):
+            raise ConfigError("--lerobot is a form of many captures; make the other forms by another command")
+        sys.exit(export_dataset(files, lerobot, rate_hz, json))
+    if rate_hz is not None:
+        raise ConfigError("--fps is the rate of --lerobot DIR, which is missing")
+    if len(files) > 1:
+        raise ConfigError("several captures become one --lerobot DIR; of the other forms each is made of one capture")
+    sys.exit(export_capture(files[0], video, rrd, foxglove, csv, parquet, attachments, camera, json))
 
 
 def export_capture(
@@ -73,7 +96,8 @@ def export_capture(
     """
     if not any((video, rrd, foxglove, csv, parquet, attachments)):
         raise ConfigError(
-            "nothing to export: give at least one of --video, --foxglove, --csv, --parquet, --rrd, --attachments"
+            "nothing to export: give at least one of --video, --foxglove, --csv, --parquet, --lerobot, --rrd, "
+            "--attachments"
         )
     for out in (video, rrd, foxglove):
         if out is not None:
@@ -123,6 +147,24 @@ def export_capture(
     return exits.FAILED if capture.problems else exits.DONE
 
 
+def export_dataset(files: Sequence[Path], out: Path, rate_hz: int | None = None, as_json: bool = False) -> int:
+    """Makes one LeRobotDataset of captures, and returns the exit code. Raises CaptureError when none can be made."""
+    from apps.captures.export import lerobot
+
+    with _bar(out) as show:
+        made = lerobot.export(files, out, rate_hz, lambda done, count: show(done / count))
+    for problem in made.problems:
+        print(f"missing: {problem}", file=sys.stderr)
+    for what in made.left_out:
+        print(f"left out: {what}", file=sys.stderr)
+    if as_json:
+        written = {"path": str(out), "episodes": made.episodes, "succeeded": made.succeeded, "rows": made.rows}
+        print_json({"written": [written], "missing": made.problems, "left_out": made.left_out})
+    else:
+        print(f"{out}: {made.episodes} episodes ({made.succeeded} succeeded), {made.rows} rows, {made.seconds:.1f} s")
+    return exits.FAILED if made.problems else exits.DONE
+
+
 def film(capture: Capture, out: Path, camera: str) -> int:
     """Makes a film of a capture, and returns the number of its pictures.
 
@@ -137,12 +179,18 @@ def film(capture: Capture, out: Path, camera: str) -> int:
 @contextmanager
 def progress_bar(capture: Capture, out: Path) -> Iterator[Callable[[float], None]]:
     """Yields a function that moves a bar to a position, s from the capture's start; shows none without a terminal."""
+    with _bar(out, (capture.end_ns - capture.start_ns) / NS) as show:
+        yield show
+
+
+@contextmanager
+def _bar(out: Path, whole: float = 1.0) -> Iterator[Callable[[float], None]]:
     if not sys.stdout.isatty():
-        yield lambda _at_s: None
+        yield lambda _at: None
         return
     from rich.markup import escape
     from rich.progress import Progress
 
     with Progress(transient=True, redirect_stdout=False, redirect_stderr=False) as progress:
-        bar = progress.add_task(escape(str(out)), total=(capture.end_ns - capture.start_ns) / NS)
-        yield lambda at_s: progress.update(bar, completed=at_s)
+        bar = progress.add_task(escape(str(out)), total=whole)
+        yield lambda at: progress.update(bar, completed=at)

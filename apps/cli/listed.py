@@ -33,7 +33,7 @@ _SUMMARIES = {
         "capture": "List captures, look at them, keep, repair and re-execute them.",
         "record": "Record what travels on the mesh into MCAP files, until Ctrl-C.",
         "replay": "Send a capture into the mesh again.",
-        "export": "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments.",
+        "export": "Turn a capture into a film, tables, a file for Foxglove or Rerun; captures into a LeRobotDataset.",
         "view": "Open Rerun on a capture, or live on the mesh; or serve the robot to Foxglove.",
     },
     TOOLS: {

@@ -162,6 +162,15 @@ CaptureArgument = Annotated[
         help="A capture: an MCAP file, latest, latest-1, or a task: 'fetch red_can'.",
     ),
 ]
+CapturesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILE...",
+        parser=capture_file,
+        autocompletion=completions.captures,
+        help="Captures: MCAP files, latest, latest-1, or a task: 'fetch red_can'; for --lerobot also folders.",
+    ),
+]
 CameraOption = Annotated[
     str,
     typer.Option(
