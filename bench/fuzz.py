@@ -15,8 +15,8 @@ from bench.report import Report
 from bench.trials import sized
 from services.base import oi
 from services.base.guard_logic import LONG, MS, SHORT, GuardLogic
-from services.servos import table
 from services.servos.bus import find_status
+from services.servos.families import FAMILIES
 
 NOISE = (0x13, 0xFF, 0x00, 0x23, 0x29)
 """Bytes that occur as headers and lengths of frames."""
@@ -87,6 +87,7 @@ class Fuzzer:
     def servo(self) -> None:
         draws = self._draws
         number, length = draws.randrange(254), draws.choice((0, 1, 2, 8))
+        family = draws.choice(tuple(FAMILIES.values()))
 
         def good() -> bytes:
             data = draws.randbytes(draws.choice((length, length, draws.randrange(20))))
@@ -95,16 +96,16 @@ class Fuzzer:
             return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
 
         data = self.mutated(good)
-        found = find_status(data, number, length)
+        found = find_status(data, number, length, family.refusals)
         if found is not None:
             assert found.packet in data
             assert found.packet[:3] == bytes([0xFF, 0xFF, number])
             assert sum(found.packet[2:]) & 0xFF == 0xFF
-            assert len(found.data) == length or (not found.data and found.error & table.REFUSALS)
+            assert len(found.data) == length or (not found.data and found.error & family.refusals)
             self.found += 1
             if length == 8 and len(found.data) == 8:
-                reading = table.reading(found.data, found.error, 0)
-                assert reading is None or 0 <= reading.position <= 1023
+                reading = family.reading(found.data, found.error, 0)
+                assert reading is None or abs(reading.load) <= 1023
 
     def run(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds

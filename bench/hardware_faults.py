@@ -30,8 +30,8 @@ from bench.hardware_driver import REACH_RAD, WHEELS
 from bench.hardware_rig import LINES, MS, NS, ROBOT, Hardware, Services
 from bench.report import Report, Table
 from bench.trials import number_of, sized
-from sim.wire.dynamixel import EmulatedServo
 from sim.wire.line import KINDS, LineFault
+from sim.wire.servo import EmulatedServo
 
 STOP_NS = 300 * MS
 AGAIN_S = 40.0

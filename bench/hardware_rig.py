@@ -17,8 +17,9 @@ import psutil
 from bench.hardware_driver import REACH_RAD, SPEED_RADPS
 from cocoro.robot import Robot
 from sim.wire.create import EmulatedCreate
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.dynamixel import EmulatedDynamixel
 from sim.wire.emulator import Emulator, SimplePlant
+from sim.wire.servo import EmulatedServoBus
 
 NS, MS = 1_000_000_000, 1_000_000
 SEEN_S = 8.0
@@ -33,8 +34,8 @@ class Hardware:
     def __init__(self, folder: Path, seed: int) -> None:
         self.create = EmulatedCreate()
         self.buses = {
-            "arm": EmulatedServoBus([EmulatedServo(number, 28) for number in range(1, 7)]),
-            "hand": EmulatedServoBus([EmulatedServo(number) for number in (7, 8, 9)]),
+            "arm": EmulatedServoBus([EmulatedDynamixel(number, 28) for number in range(1, 7)]),
+            "hand": EmulatedServoBus([EmulatedDynamixel(number) for number in (7, 8, 9)]),
         }
         self.servos = {servo.number: servo for bus in self.buses.values() for servo in bus.servos}
         self.body = SimplePlant(self.create, *self.buses.values())

@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.errors import ConfigError
+from cocoro.servo_units import UNITS, Protocol, ServoUnits
 from cocoro.units import Positive, Vec3
 
 OWN_FILE = "calliope.toml"
@@ -22,11 +23,6 @@ _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name need
 
 LensValues = tuple[float, float, float, float, float, float, float, float, float]
 """fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
-
-SERVO_COUNTS = 1024
-SERVO_RANGE_RAD = radians(300.0)
-SERVO_COUNT_RAD = SERVO_RANGE_RAD / (SERVO_COUNTS - 1)
-"""0..1023 stand for 0..300 degrees (ROBOTIS AX-12 manual)."""
 
 
 class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -122,6 +118,8 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive
     command_timeout_s: Positive
     """A command to these joints is valid for this time."""
+    protocol: Protocol = "dynamixel"
+    """What its servos speak."""
 
 
 class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -202,7 +200,7 @@ class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `mount` is the mount."""
 
 
-class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JointRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     network: Literal["arm", "hand"]
     id: int
@@ -214,7 +212,8 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     overload_s: Positive = 5.0
     """A servo that pushes at its limit for this long is overloaded."""
     direction: Literal[-1, 1] = 1
-    centre_count: float = (SERVO_COUNTS - 1) / 2
+    centre_count: float | None = None
+    """The servo's position at the joint's angle 0; by default the middle of the servo's range."""
 
     def __post_init__(self) -> None:
         if not self.limits_deg[0] < self.limits_deg[1]:
@@ -224,14 +223,27 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def limits_rad(self) -> tuple[float, float]:
         return radians(self.limits_deg[0]), radians(self.limits_deg[1])
 
+
+class Joint(JointRow, frozen=True):
+    """A row of the description with what follows from its network's protocol."""
+
+    centre_count: float = UNITS["dynamixel"].centre_count
+    units: ServoUnits = UNITS["dynamixel"]
+
+    @classmethod
+    def of(cls, row: JointRow, protocol: Protocol) -> Joint:
+        units = UNITS[protocol]
+        centre_count = units.centre_count if row.centre_count is None else row.centre_count
+        return cls(**{**msgspec.structs.asdict(row), "centre_count": centre_count, "units": units})
+
     def to_count(self, angle_rad: float) -> int:
-        """The servo position nearest to a joint angle (radians), clipped to 0..1023."""
-        count = round(self.centre_count + self.direction * angle_rad / SERVO_COUNT_RAD)
-        return min(max(count, 0), SERVO_COUNTS - 1)
+        """The servo position nearest to a joint angle (radians), clipped to the servo's range."""
+        count = round(self.centre_count + self.direction * angle_rad / self.units.count_rad)
+        return min(max(count, 0), self.units.counts - 1)
 
     def to_angle(self, count: float) -> float:
         """The joint angle, radians, of a servo position."""
-        return self.direction * (count - self.centre_count) * SERVO_COUNT_RAD
+        return self.direction * (count - self.centre_count) * self.units.count_rad
 
 
 class LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -254,7 +266,7 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm: Arm
     marker: Marker
     network: dict[Literal["arm", "hand"], Network]
-    joint: list[Joint]
+    joint: list[JointRow]
     claw: Claw
     hull: Hull
     pose: dict[str, dict[str, float]]
@@ -304,6 +316,8 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def _check_limbs(self) -> None:
         arm, joints = self.arm, {joint.name for joint in self.joint}
+        if lost := [joint for joint in self.joint if joint.network not in self.network]:
+            raise ValueError(f"joint {lost[0].name}: there is no network {lost[0].network!r}")
         limbs = [("claw", set(self.claw.open_sign)), ("head", {self.head.pan, self.head.tilt})]
         limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]

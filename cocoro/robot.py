@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
-from cocoro.description import Description, Network, completed, read
+from cocoro.description import Description, Joint, Network, completed, read
 from cocoro.errors import ConfigError, field_text
 from cocoro.kinematics import Chain, Link, Tree
 
@@ -60,7 +60,7 @@ class Robot:
         self.hull = spec.hull
         self.poses = spec.pose
         self.solid = spec.solid
-        self.joints = {joint.name: joint for joint in spec.joint}
+        self.joints = {row.name: Joint.of(row, spec.network[row.network].protocol) for row in spec.joint}
         self.links = {
             row.name: Link(
                 row.name,
@@ -105,7 +105,7 @@ class Robot:
         """A robot like this one with other values in its `[base]` table."""
         return Robot(msgspec.structs.replace(self._spec, base=msgspec.structs.replace(self.base, **changes)))
 
-    def with_networks(self, **changes: float) -> Robot:
+    def with_networks(self, **changes: float | str) -> Robot:
         """A robot like this one with other values in both of its `[network]` tables."""
         networks = {name: msgspec.structs.replace(row, **changes) for name, row in self._spec.network.items()}
         return Robot(msgspec.structs.replace(self._spec, network=networks))

@@ -14,11 +14,8 @@ from cocoro.description import Joint
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
 
-SPEED_COUNT_RADPS = 0.111 * 2 * 3.141592653589793 / 60
-"""The unit of speed registers (ROBOTIS AX-12 manual)."""
-LOAD_COUNTS = 1023
-AT_GOAL_COUNTS = 2
-"""A joint this close to its goal has arrived: it is not stopped when its command expires."""
+AT_GOAL_RAD = radians(0.59)
+"""A joint this close to its goal, two counts of an AX-12, has arrived: it is not stopped when its command expires."""
 PUNCH = 0.1
 """Least share of its torque limit with which a compliant servo pushes."""
 OVERLOAD_SHARE = 0.98
@@ -88,13 +85,15 @@ class SimServo:
 
     @property
     def speed_radps(self) -> float:
-        return round(self._speed_radps / SPEED_COUNT_RADPS) * SPEED_COUNT_RADPS
+        unit = self.joint.units.speed_radps
+        return round(self._speed_radps / unit) * unit
 
     @property
     def load(self) -> float:
         """Share of the stall torque, -1 to 1."""
         share = self._torque_nm / self.joint.torque_nm
-        return round(min(max(share, -1.0), 1.0) * LOAD_COUNTS) / LOAD_COUNTS
+        full = self.joint.units.full_torque
+        return round(min(max(share, -1.0), 1.0) * full) / full
 
     def command(self, goal_rad: float, speed_radps: float, until_ns: int) -> None:
         """Go to a goal within the joint's limits; a speed of 0 holds where the joint is."""
@@ -104,8 +103,8 @@ class SimServo:
             return
         low, high = self.joint.limits_rad
         self.goal_count = self.joint.to_count(min(max(goal_rad, low), high))
-        counts = max(1, round(speed_radps / SPEED_COUNT_RADPS))
-        self.speed_limit_radps = min(counts * SPEED_COUNT_RADPS, self.joint.max_speed_radps)
+        unit = self.joint.units.speed_radps
+        self.speed_limit_radps = min(max(1, round(speed_radps / unit)) * unit, self.joint.max_speed_radps)
 
     @property
     def commanded(self) -> bool:
@@ -123,7 +122,7 @@ class SimServo:
         if self._valid_until_ns is None or now_ns <= self._valid_until_ns:
             return False
         self._valid_until_ns = None
-        if abs(self.goal_count - self.count) <= AT_GOAL_COUNTS:
+        if abs(self.goal_count - self.count) * self.joint.units.count_rad <= AT_GOAL_RAD:
             return False
         self._hold_here()
         return True

@@ -1,4 +1,4 @@
-"""A servo service in a separate process that is commanded to turn the elbow: `python move_forever.py ARM HAND`."""
+"""A servo service in a separate process that turns the elbow: `python move_forever.py ARM HAND PROTOCOL`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from cocoro.robot import Robot
 from services.servos.service import ServosConfig, run
 
 
-async def main(arm: str, hand: str) -> None:
-    mesh, clock, robot = LocalMesh(), RealClock(), Robot.load()
+async def main(arm: str, hand: str, protocol: str) -> None:
+    mesh, clock = LocalMesh(), RealClock()
+    robot = Robot.load().with_networks(protocol=protocol)
     async with Node("servos", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
         other.spawn(run(node, ServosConfig(arm_port=arm, hand_port=hand, reply_s=0.1)))
         async for _ in other.every(50.0):

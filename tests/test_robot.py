@@ -12,11 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import ConfigError
+from cocoro.learning.handmap import fingerprint_of
 from cocoro.robot import Camera, Robot
+from cocoro.servo_units import UNITS
 
 ROBOT = Robot.load()
+COUNT_RAD = UNITS["dynamixel"].count_rad
 TEXT = resources.files("cocoro").joinpath("calliope.toml").read_text()
 
 
@@ -56,7 +58,34 @@ def test_a_servo_position_comes_back_as_it_was(name: str, count: int) -> None:
 def test_a_goal_is_met_to_half_a_count_or_to_the_range_s_end(name: str, angle_rad: float) -> None:
     joint = ROBOT.joints[name]
     goal_rad = min(max(angle_rad, -radians(150)), radians(150))
-    assert abs(joint.to_angle(joint.to_count(angle_rad)) - goal_rad) <= SERVO_COUNT_RAD / 2 + 1e-12
+    assert abs(joint.to_angle(joint.to_count(angle_rad)) - goal_rad) <= COUNT_RAD / 2 + 1e-12
+
+
+def test_a_networks_protocol_gives_its_joints_their_counts_unless_a_zero_was_measured(tmp_path: Path) -> None:
+    own = written(tmp_path, '[network.arm]\nprotocol = "feetech"\n[[joint]]\nname = "elbow"\ncentre_count = 2100.0\n')
+    for robot in (Robot.load(override=own), Robot.from_data(Robot.load(override=own).to_data())):
+        zeros = [robot.joints[name].centre_count for name in ("shoulder", "elbow", "claw_left")]
+        assert zeros == [2048.0, 2100.0, 511.5]
+        assert robot.joints["shoulder"].to_angle(2048 + 1024) == pytest.approx(radians(90))
+
+
+def test_a_description_from_before_networks_had_a_protocol_is_of_dynamixels() -> None:
+    data = ROBOT.to_data()
+    for network in data["network"].values():
+        del network["protocol"]
+    for joint in data["joint"]:
+        joint["centre_count"] = 511.5  # as it is in every older capture
+    assert Robot.from_data(data).joints == ROBOT.joints
+    assert fingerprint_of(Robot.from_data(data)) == fingerprint_of(ROBOT)
+
+
+def test_a_protocol_that_nobody_speaks_and_a_joint_without_a_network_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Invalid enum value 'morse'"):
+        Robot.load(override=written(tmp_path, '[network.arm]\nprotocol = "morse"\n'))
+    data = ROBOT.to_data()
+    del data["network"]["hand"]
+    with pytest.raises(ConfigError, match="joint wrist_roll: there is no network 'hand'"):
+        Robot.from_data(data)
 
 
 # --- camera ---------------------------------------------------------------------------------------

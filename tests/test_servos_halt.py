@@ -8,13 +8,14 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 
 from services.servos.bus import SilentError
-from services.servos.line import ServoLine, ServoSettings
+from services.servos.dynamixel import DYNAMIXEL
+from services.servos.family import ServoReading
+from services.servos.line import ServoLine
 from services.servos.motion import HOLD_RADPS
-from services.servos.table import SPEED_RADPS, ServoReading
 
 PATIENCE_S = 60.0
 FAR = {5: (900, 30)}
-HOLD = round(HOLD_RADPS / SPEED_RADPS)
+HOLD = round(HOLD_RADPS / DYNAMIXEL.units.speed_radps)
 
 
 class Wire:
@@ -62,7 +63,7 @@ def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
 
     async def run() -> None:
         wire = Wire()
-        line = ServoLine("nowhere", 1, {5: ServoSettings(32, 1023)}, 200.0, 0.1, lambda _: None, keeps_goal)
+        line = ServoLine("nowhere", 1, DYNAMIXEL, {5: {"torque_limit": 1023}}, 200.0, 0.1, lambda _: None, keeps_goal)
         line._open = lambda: wire  # type: ignore[assignment, return-value]
         line.start()
         try:

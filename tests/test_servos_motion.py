@@ -10,18 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cocoro.clock import NS
-from cocoro.description import SERVO_COUNT_RAD, Joint
+from cocoro.description import Joint
 from cocoro.messages import ServoCommand
 from cocoro.robot import Robot
-from services.servos import table
+from cocoro.servo_units import UNITS
+from services.servos.dynamixel import DYNAMIXEL
+from services.servos.family import ServoReading
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
 from services.servos.network import MISSES, ServoNetwork, ServoStatus, ServoTask
-from services.servos.table import ServoReading
 
 ROBOT = Robot.load()
 MS = 1_000_000
 ELBOW, SHOULDER, WRIST = (ROBOT.joints[name] for name in ("elbow", "shoulder", "wrist_pitch"))
-COUNT = SERVO_COUNT_RAD
+COUNT = UNITS["dynamixel"].count_rad
 
 
 class Led:
@@ -48,7 +49,7 @@ class Led:
                 self.goals.append(self.motion.joint.to_angle(order[0]))
                 self.speeds.append(order[1])
             self.now_ns += 20 * MS
-            step = self.speeds[-1] * table.SPEED_RADPS / 50
+            step = self.speeds[-1] * DYNAMIXEL.units.speed_radps / 50
             left = self.goals[-1] - self.position_rad
             self.position_rad += min(max(left, -step), step)
             self.position_rad = min(self.position_rad, self.blocked_at_rad)
@@ -130,7 +131,7 @@ def test_goals_stay_within_the_limits_and_speeds_within_the_servos() -> None:
     led.command(-3.0, 100.0, for_ms=10_000)
     led.run(2.0)
     assert led.position_rad == pytest.approx(SHOULDER.limits_rad[0], abs=COUNT)
-    assert max(led.speeds) == round(SHOULDER.max_speed_radps / table.SPEED_RADPS)
+    assert max(led.speeds) == round(SHOULDER.max_speed_radps / DYNAMIXEL.units.speed_radps)
 
 
 # --- networks --------------------------------------------------------------------------------------
@@ -145,7 +146,7 @@ class Net:
 
     def __init__(self, name: str = "arm") -> None:
         joints = [ROBOT.joints[joint] for joint in ROBOT.network_joints(name)]
-        self.net = ServoNetwork(joints, keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
+        self.net = ServoNetwork(joints, DYNAMIXEL, keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
         self.net.port_fault = ""
         self.now_ns = NS
         self.tasks: list[ServoTask] = []
@@ -352,7 +353,7 @@ def test_a_clock_that_begins_anew_ends_what_was_commanded(arm: Net) -> None:
 def test_a_command_is_refused_by_the_age_of_its_own_topic() -> None:
     joint = ROBOT.joints["wrist_roll"]
     for max_age_s, answer in ((0.05, "too old"), (0.15, "")):
-        net = ServoNetwork([joint], keeps_goal=True, timeout_s=0.2, max_age_s=max_age_s)
+        net = ServoNetwork([joint], DYNAMIXEL, keeps_goal=True, timeout_s=0.2, max_age_s=max_age_s)
         net.set_latch("released")
         command = ServoCommand(stamp_ns=NS, joints=(joint.name,), goal_rad=(0.1,), speed_radps=(1.0,))
         assert net.command(command, NS + 100 * MS) == answer
@@ -370,7 +371,7 @@ def test_measured_joint_limits_are_what_the_servo_line_keeps(tmp_path: Path) -> 
 
 def test_direction_and_centre_of_a_joint_are_its_own() -> None:
     joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0)
-    net = ServoNetwork([joint], keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
+    net = ServoNetwork([joint], DYNAMIXEL, keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
     net.read(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None

@@ -10,15 +10,15 @@ from functools import wraps
 from pathlib import Path
 
 import pytest
-from wire_servos import LONG_S, MS, REPLY_S, ServoBench, angle, moved
+from wire_servos import LONG_S, MS, WHEEL, ServoBench, angle, inspected, moved
 
 from cocoro import topics
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import ConfigError, RemoteError
 from cocoro.messages import EstopRequest, ServoRequest
 from cocoro.robot import Robot
+from cocoro.servo_units import UNITS, Protocol
 from cocoro.testing import ServiceUnderTest
-from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
+from services.servos.bus import PortError, RefusedWriteError, SilentError
 from services.servos.line import STATE
 from services.servos.motion import LEAD_S, REACH_RAD
 from sim.wire.line import LineFault
@@ -29,9 +29,10 @@ ELBOW = 5
 FOREVER_NS = 10**19
 
 
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[ServoBench]:
-    with ServoBench(tmp_path, overload_s=0.3) as bench:
+@pytest.fixture(params=UNITS)
+def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[ServoBench]:
+    protocol: Protocol = request.param
+    with ServoBench(tmp_path, overload_s=0.3, protocol=protocol) as bench:
         yield bench
 
 
@@ -47,48 +48,48 @@ def in_real_time(test: Callable[[ServoBench], Coroutine[None, None, None]]) -> C
 
 
 def test_registers_are_read_and_written_over_the_wire(bench: ServoBench) -> None:
-    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
-        assert bus.ping(ELBOW) == 28
+    with bench.bus() as bus:
+        assert bench.family.models[bus.ping(ELBOW) or 0] in ("RX-28", "STS3215")
         assert bus.ping(99) is None
         bus.write(ELBOW, "torque_limit", 700)
         assert bus.read(ELBOW, "torque_limit") == 700
-        assert bench.servo(ELBOW).get(34) == 700
-        with pytest.raises(RefusedWriteError, match="servo 5 refuses 254 for its id: range"):
-            bus.write(ELBOW, "id", 254)
+        assert bench.get(ELBOW, "torque_limit") == 700
+        with pytest.raises(RefusedWriteError, match=r"servo 5 (refuses 254 for|does not take 254)"):
+            bus.keep(ELBOW, "id", 254)
         with pytest.raises(SilentError, match="servo 99 does not answer"):
             bus.read(99, "voltage")
 
 
 def test_several_goals_go_in_one_packet(bench: ServoBench) -> None:
-    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
+    with bench.bus() as bus:
         bus.go({4: (400, 30), 5: (500, 40)})
         assert bus.read(5, "goal_position") == 500
-        assert (bench.servo(4).get(30), bench.servo(4).get(32)) == (400, 30)
+        assert (bench.get(4, "goal_position"), bench.get(4, "moving_speed")) == (400, 30)
 
 
 def test_at_a_wrong_baud_rate_nobody_answers(bench: ServoBench) -> None:
-    with ServoBus(bench.port("arm"), 57_600, 0.02) as bus:
+    with bench.bus(baud=57_600, reply_s=0.02) as bus:
         assert bus.ping(ELBOW) is None
 
 
 def test_a_damaged_answer_is_no_answer_and_the_next_is_read(bench: ServoBench) -> None:
     line = bench.emulator.lines["arm"]
-    with ServoBus(bench.port("arm"), 1_000_000, 0.02) as bus:
+    with bench.bus(reply_s=0.02) as bus:
         bench.call(lambda: line.disturb(LineFault("corrupted", 0.5, "to_driver", FOREVER_NS)))
         for _ in range(10):
             with pytest.raises(SilentError):
                 bus.reading(ELBOW)
         assert bus.strays > 0
         bench.call(line.undisturb)
-        assert ServoBus.reading(bus, ELBOW).position == bench.servo(ELBOW).get(36)
+        assert bus.reading(ELBOW).position == bench.get(ELBOW, "present_position")
 
 
-def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench, tmp_path: Path) -> None:
+def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench) -> None:
     with pytest.raises(PortError, match="is the adapter plugged in"):
-        ServoBus(str(tmp_path / "nothing"), 1_000_000)
-    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
+        bench.bus("nothing")
+    with bench.bus() as bus:
         with pytest.raises(PortError, match="another program has it open"):
-            ServoBus(bench.port("arm"), 1_000_000)
+            bench.bus()
         bench.call(bench.emulator.lines["arm"].port.unplug)
         with pytest.raises(PortError):
             bus.reading(ELBOW)
@@ -96,14 +97,14 @@ def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench, tmp_pa
 
 def test_an_answer_that_comes_late_is_not_taken_for_that_to_another_question(bench: ServoBench) -> None:
     line = bench.emulator.lines["arm"]
-    bench.put(ELBOW, {28: 2, 29: 2})  # in a reading's place these would be a load
-    with ServoBus(bench.port("arm"), 1_000_000, 0.3) as bus:
+    centre = bench.get(ELBOW, "present_position")
+    with bench.bus(reply_s=0.3) as bus:
         for _ in range(3):
             bench.call(lambda: line.disturb(LineFault("late", 1.0, "to_driver", FOREVER_NS, 450 * MS)))
             with pytest.raises(SilentError):
-                bus.read_block(ELBOW, *STATE)
+                bus.read_block(ELBOW, *bench.family.block(*STATE))
             bench.call(line.undisturb)
-            assert bus.reading(ELBOW).position == 512
+            assert bus.reading(ELBOW).position == centre
             assert bus.strays > 0
 
 
@@ -115,23 +116,23 @@ async def test_joints_go_where_they_are_told_and_tell_where_they_are(bench: Serv
     async with moved(bench) as servos:
         servos.move("arm", elbow=0.6, shoulder=0.4)
         servos.move("hand", claw_left=-0.3)
-        state = await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.6) < 2 * SERVO_COUNT_RAD)
-        assert angle(state, "shoulder") == pytest.approx(0.4, abs=2 * SERVO_COUNT_RAD)
-        await servos.state("hand", lambda state: abs(angle(state, "claw_left") + 0.3) < 2 * SERVO_COUNT_RAD)
-        assert bench.servo(ELBOW).get(32) == round(1.0 / 0.011623892)
+        state = await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.6) < 2 * bench.units.count_rad)
+        assert angle(state, "shoulder") == pytest.approx(0.4, abs=2 * bench.units.count_rad)
+        await servos.state("hand", lambda state: abs(angle(state, "claw_left") + 0.3) < 2 * bench.units.count_rad)
+        assert bench.get(ELBOW, "moving_speed") == round(1.0 / bench.units.speed_radps)
 
 
 @in_real_time
 async def test_torque_comes_on_without_a_snap(bench: ServoBench) -> None:
-    servo = bench.servo(ELBOW)
-    bench.put(ELBOW, {30: 1000, 36: 512})
+    servo, centre = bench.servo(ELBOW), bench.get(ELBOW, "present_position")
+    bench.put(ELBOW, goal_position=1000)
     async with moved(bench):
         written = [(address, value) for _, address, value in bench.call(servo.acted.copy)]
         first = [address for address, _ in written]
-        assert first.index(32) < first.index(30)  # the speed before what may make it move
-        assert first.index(30) < first.index(24)  # the goal before the torque
-        goals = [value for address, value in written if address == 30]
-        assert set(goals) == {512}
+        speed, goal, torque = (bench.at(name) for name in ("moving_speed", "goal_position", "torque_enable"))
+        assert first.index(speed) < first.index(goal)  # the speed before what may make it move
+        assert first.index(goal) < first.index(torque)  # the goal before the torque
+        assert {value for address, value in written if address == goal} == {centre}
 
 
 @in_real_time
@@ -143,7 +144,7 @@ async def test_an_arm_stops_when_no_command_comes_any_more_and_the_hand_goes_on(
         servos.silence()
         stopped = await servos.state("arm", lambda state: state.speed_radps[state.joints.index("elbow")] == 0.0)
         assert angle(stopped, "elbow") < 2.0
-        await servos.state("hand", lambda state: abs(angle(state, "claw_left") + 1.0) < 2 * SERVO_COUNT_RAD)
+        await servos.state("hand", lambda state: abs(angle(state, "claw_left") + 1.0) < 2 * bench.units.count_rad)
 
 
 @in_real_time
@@ -165,14 +166,30 @@ async def test_an_overload_is_told_and_cleared_on_purpose(bench: ServoBench) -> 
         bench.call(lambda: bench.body.blocked.add(ELBOW))
         servos.move("arm", elbow=1.0)
         await servos.fault("arm", "elbow: overload; `cocoro servos clear`")
-        assert bench.servo(ELBOW).get(34) == 0
+        assert bench.call(lambda: bench.servo(ELBOW).motor.limit) <= 0.2
         bench.call(bench.body.blocked.clear)
         servos.silence()
         reply = await servos.service.ask(topics.SERVOS.of("arm"), ServoRequest(action="clear"))
         assert (reply.joints, reply.text) == (("elbow",), "")
-        assert bench.servo(ELBOW).get(34) == 1023
+        assert bench.call(lambda: bench.servo(ELBOW).motor.limit) == 1.0
         servos.move("arm", elbow=0.5)
-        await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * SERVO_COUNT_RAD)
+        await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * bench.units.count_rad)
+
+
+@in_real_time
+async def test_a_servo_that_is_set_up_as_a_wheel_is_made_limp_and_gets_no_orders(bench: ServoBench) -> None:
+    bench.put(ELBOW, torque_enable=1, moving_speed=500, **WHEEL[bench.family.protocol])
+    async with inspected(bench) as servos:
+        await servos.fault("arm", "elbow: servo 5 is set up as a wheel")
+        servos.move("arm", elbow=1.0, shoulder=0.2)
+        await servos.state("arm", lambda state: "shoulder" in state.joints and angle(state, "shoulder") > 0.15)
+        assert bench.get(ELBOW, "torque_enable") == 0
+        written = {address for _, address, _ in bench.call(bench.servo(ELBOW).acted.copy)}
+        assert written == {bench.at("torque_enable")}
+        repaired = {"dynamixel": {"high_limit": 1023}, "feetech": {"mode": 0}}
+        bench.put(ELBOW, **repaired[bench.family.protocol])
+        reply = await servos.service.ask(topics.SERVOS.of("arm"), ServoRequest(action="clear"))
+        assert (reply.joints, reply.text) == (("elbow",), "")
 
 
 @in_real_time
@@ -180,13 +197,13 @@ async def test_joints_are_relaxed_and_held_on_request(bench: ServoBench) -> None
     async with moved(bench) as servos:
         ask = servos.service.ask
         reply = await ask(topics.SERVOS.of("arm"), ServoRequest(action="relax", joints=("elbow",)))
-        assert (reply.joints, bench.servo(ELBOW).get(24)) == (("elbow",), 0)
-        bench.call(lambda: bench.servo(ELBOW).put(30, 512))
+        assert (reply.joints, bench.get(ELBOW, "torque_enable")) == (("elbow",), 0)
+        bench.put(ELBOW, goal_position=512)
         servos.move("arm", elbow=1.0, shoulder=0.2)
         await servos.state("arm", lambda state: angle(state, "shoulder") > 0.15)
-        assert bench.servo(ELBOW).get(24) == 0  # it was not written a goal, which would have made it hold
+        assert bench.get(ELBOW, "torque_enable") == 0  # it was not written a goal, which would have made it hold
         await ask(topics.SERVOS.of("arm"), ServoRequest(action="hold"))
-        assert bench.servo(ELBOW).get(24) == 1
+        assert bench.get(ELBOW, "torque_enable") == 1
         with pytest.raises(RemoteError, match="arm has no joint 'claw_left'"):
             await ask(topics.SERVOS.of("arm"), ServoRequest(action="relax", joints=("claw_left",)))
 
@@ -213,24 +230,26 @@ async def test_a_disturbed_line_is_told_and_obeyed_no_wrong_way(bench: ServoBenc
         await servos.fault("arm", "the line is disturbed, check its cables")
         bench.call(line.undisturb)
         await servos.state("arm", lambda state: "elbow" in state.joints and angle(state, "elbow") > 0.35)
-        goals = [value for _, address, value in bench.call(bench.servo(ELBOW).acted.copy) if address == 30]
+        written, goal = bench.call(bench.servo(ELBOW).acted.copy), bench.at("goal_position")
+        goals = [value for _, address, value in written if address == goal]
         assert goals
-        assert all(500 <= goal <= 600 for goal in goals)
+        assert bench.count("elbow", -0.06) <= min(goals) <= max(goals) <= bench.count("elbow", 0.45)
 
 
 @in_real_time
 async def test_a_servo_whose_power_comes_back_holds_again_where_it_is(bench: ServoBench) -> None:
     async with moved(bench) as servos:
         servos.move("arm", elbow=0.5)
-        await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * SERVO_COUNT_RAD)
+        await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * bench.units.count_rad)
         servos.silence()
-        bench.put(ELBOW, {42: 40})
+        bench.put(ELBOW, voltage=30)
         await servos.fault("arm", "elbow (ID 5) does not answer")
-        bench.put(ELBOW, {42: 120})
+        bench.put(ELBOW, voltage=120)
         bench.call(bench.servo(ELBOW).power_up)
         state = await servos.state("arm", lambda state: len(state.joints) == 6 and all(state.torque_enabled))
-        assert angle(state, "elbow") == pytest.approx(0.5, abs=3 * SERVO_COUNT_RAD)
-        assert bench.servo(ELBOW).get(28) == 2  # its slopes were lost, too
+        assert angle(state, "elbow") == pytest.approx(0.5, abs=3 * bench.units.count_rad)
+        settings = bench.family.settings(bench.robot.joints["elbow"], 1.0)
+        assert {name: bench.get(ELBOW, name) for name in settings} == settings  # they were lost, too
 
 
 @in_real_time
@@ -238,7 +257,7 @@ async def test_a_short_loss_of_power_is_noticed_told_and_made_good(bench: ServoB
     async with moved(bench) as servos:
         bench.call(lambda: bench.servo(ELBOW).power_up())
         await servos.fault("arm", "elbow lost its settings")
-        await bench.until(lambda: bench.servo(ELBOW).get(24) and bench.servo(ELBOW).get(28) == 2)
+        await bench.until(lambda: bench.get(ELBOW, "torque_enable") and bench.get(ELBOW, "moving_speed"))
 
 
 @in_real_time
@@ -256,14 +275,14 @@ async def test_a_pulled_adapter_is_a_fault_of_its_network_alone(bench: ServoBenc
 async def test_a_restarted_service_does_not_drop_what_the_hand_holds(bench: ServoBench) -> None:
     async with moved(bench) as servos:
         bench.call(lambda: bench.body.blocked.add(8))
-        bench.servo(8).overload_s = 100.0
+        bench.tireless(8)
         servos.move("hand", claw_left=1.0)
         await servos.state("hand", lambda state: state.load[state.joints.index("claw_left")] > 0.9)
-    goal = bench.servo(8).get(30)
+    goal = bench.get(8, "goal_position")
     async with moved(bench) as servos:
         state = await servos.state("hand", lambda state: True)
         assert state.load[state.joints.index("claw_left")] > 0.9
-        assert bench.servo(8).get(30) == pytest.approx(goal, abs=2)
+        assert bench.get(8, "goal_position") == pytest.approx(goal, abs=2)
 
 
 def test_an_unknown_joint_in_the_configuration_is_refused() -> None:
@@ -278,15 +297,17 @@ def test_an_unknown_joint_in_the_configuration_is_refused() -> None:
 @pytest.mark.process
 def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) -> None:
     script = Path(__file__).with_name("move_forever.py")
-    service = subprocess.Popen([sys.executable, str(script), bench.port("arm"), bench.port("hand")])
-    servo = bench.servo(ELBOW)
+    service = subprocess.Popen(
+        [sys.executable, str(script), bench.port("arm"), bench.port("hand"), bench.family.protocol]
+    )
     try:
-        bench.emulator.until(lambda: servo.get(36) > 600)
+        bench.emulator.until(lambda: bench.get(ELBOW, "present_position") > bench.count("elbow", 0.45))
     finally:
         service.kill()
         service.wait()
-    killed_at = bench.call(lambda: servo.get(36))
-    bench.emulator.until(lambda: servo.get(36) == servo.get(30))
+    killed_at = bench.call(lambda: bench.get(ELBOW, "present_position"))
+    bench.emulator.until(lambda: bench.get(ELBOW, "present_position") == bench.get(ELBOW, "goal_position"))
+    went = bench.get(ELBOW, "present_position") - killed_at
     # Normally 0.2 s of travel; on a busy machine at most the upper bound for the point ahead of the joint.
-    assert servo.get(36) - killed_at < (REACH_RAD + LEAD_S * 0.5) / SERVO_COUNT_RAD + 10
-    assert servo.get(36) < 1000
+    assert went * bench.units.count_rad < REACH_RAD + LEAD_S * 0.5 + 0.05
+    assert bench.get(ELBOW, "present_position") < bench.count("elbow", 2.5)

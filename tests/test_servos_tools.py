@@ -9,14 +9,14 @@ from math import degrees
 from pathlib import Path
 
 import pytest
-from wire_servos import REPLY_S, ServoBench
+from wire_servos import REPLY_S, WHEEL, ServoBench
 
 from apps.cli.doctor import _own_checks
 from apps.cli.main import main
 from apps.cli.servos import ServoWorkbench
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import RefusedError
 from cocoro.robot import Robot
+from cocoro.servo_units import UNITS, Protocol
 from deploy import profiles
 from deploy.processes import named
 from services.base.doctor import check as check_base
@@ -24,26 +24,37 @@ from services.base.service import BaseConfig
 from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.doctor import check as check_servos
+from services.servos.dynamixel import DYNAMIXEL
+from services.servos.feetech import FEETECH
 from services.servos.service import ServosConfig
 from sim.wire.create import EmulatedCreate
-from sim.wire.emulator import Emulator
+from sim.wire.dynamixel import EmulatedDynamixel
+from sim.wire.emulator import Emulator, SimplePlant
+from sim.wire.feetech import EmulatedFeetech
+from sim.wire.servo import EmulatedServoBus
 
 ROBOT = Robot.load()
-ELBOW = ROBOT.joints["elbow"]
 
 
 pytestmark = pytest.mark.zenoh  # each answer of the emulated wire must come within some real time
 
 
+both = pytest.mark.parametrize("bench", UNITS, indirect=True)
+"""A test of both families; the others are of Dynamixels."""
+CODES = {"dynamixel": 3, "feetech": 1}
+"""The values of the register `baud` for 500,000."""
+
+
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[ServoBench]:
-    with ServoBench(tmp_path) as bench:
+def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[ServoBench]:
+    protocol: Protocol = getattr(request, "param", "dynamixel")
+    with ServoBench(tmp_path, protocol=protocol) as bench:
         yield bench
 
 
 @pytest.fixture
 def line(bench: ServoBench) -> Iterator[ServoBus]:
-    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as line:
+    with bench.bus() as line:
         yield line
 
 
@@ -51,25 +62,41 @@ def told(text: str) -> None:
     pass
 
 
+@both
 def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "SCAN_S", 0.1)
-    bench.put(4, {4: 16, 5: 250})  # 117647 baud is 115200 to a port, nearly
-    bench.put(4, {4: 3})  # 500000
+    protocol = bench.family.protocol
+    bench.put(4, baud=CODES[protocol], return_delay=250)
     lines: list[str] = []
     found = list(tools.scan([bench.port("arm"), "/dev/nothing"], [1_000_000, 500_000], range(3, 6), lines.append))
-    assert [(one.number, one.baud, one.model) for one in found] == [
-        (3, 1_000_000, "RX-28"),
-        (5, 1_000_000, "RX-28"),
-        (4, 500_000, "RX-28"),
+    kind = {"dynamixel": "RX-28", "feetech": "STS3215"}[protocol], protocol
+    assert [(one.number, one.baud, one.model, one.protocol) for one in found] == [
+        (3, 1_000_000, *kind),
+        (5, 1_000_000, *kind),
+        (4, 500_000, *kind),
     ]
     assert found[2].return_delay_us == 500
     assert any("/dev/nothing: there is no such port" in line for line in lines)
 
 
+def test_a_scan_tells_the_families_on_one_line_from_each_other(tmp_path: Path) -> None:
+    bus = EmulatedServoBus([EmulatedDynamixel(1), EmulatedFeetech(2), EmulatedDynamixel(3, 28)])
+    bus.servos[0].put(0, 999)  # a model that nobody knows
+    with Emulator(tmp_path, {"line": bus}, SimplePlant(None, bus)), ServoBus(str(tmp_path / "line"), 1_000_000) as line:
+        line.family = FEETECH
+        assert [tools.recognise(line, number) for number in (2, 3, 4)] == [True, True, False]
+        line.family = DYNAMIXEL
+        models = [tools.examine(line, 0, number).model for number in (1, 2, 3) if tools.recognise(line, number)]
+        assert models == ["model 999", "STS3215", "RX-28"]
+
+
+@both
 def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: ServoBus) -> None:
-    bench.call(lambda: bench.servo(5).put(5, 250))
+    bench.put(5, return_delay=250)
+    line.family = FEETECH  # the servo says what it is
     tools.set_number(line, 5, 50)
-    assert bench.call(lambda: (bench.servo(50).get(3), bench.servo(50).get(5))) == (50, 0)
+    bench.call(bench.servo(50).power_up)  # it keeps them
+    assert bench.call(lambda: (bench.get(50, "id"), bench.get(50, "return_delay"))) == (50, 0)
     tools.set_number(line, 50, 50)
     with pytest.raises(RefusedError, match="there is a servo 4 on this line already"):
         tools.set_number(line, 50, 4)
@@ -84,26 +111,44 @@ def by_hand(bench: ServoBench, *counts: int) -> Callable[[str], None]:
     def turn(_: str) -> None:
         count = left.pop(0)
         bench.call(lambda: bench.body.turn_by_hand(5, count))
-        bench.emulator.until(lambda: bench.servo(5).get(36) == count)
+        bench.emulator.until(lambda: bench.servo(5).shaft == count)
 
     return turn
 
 
-@pytest.mark.parametrize(("turned", "direction", "centre"), [(700, 1, 600), (500, -1, 600)])
+@both
+@pytest.mark.parametrize(("turned", "direction"), [(700, 1), (500, -1)])
 def test_zero_and_direction_come_from_two_turns_by_hand(
-    bench: ServoBench, line: ServoBus, turned: int, direction: int, centre: float
+    bench: ServoBench, line: ServoBus, turned: int, direction: int
 ) -> None:
-    values = tools.calibrate(line, ELBOW, 0.0, by_hand(bench, 600, turned))
+    elbow = bench.robot.joints["elbow"]
+    centre = 600 if bench.family.centring is None else 2048
+    values = tools.calibrate(line, elbow, 0.0, by_hand(bench, 600, turned))
     assert values == {"direction": direction, "centre_count": centre}
-    values = tools.calibrate(line, ELBOW, 30.0, by_hand(bench, 600, turned))
-    assert values["centre_count"] == pytest.approx(600 - direction * 30.0 / degrees(SERVO_COUNT_RAD), abs=0.01)
+    values = tools.calibrate(line, elbow, 30.0, by_hand(bench, 600, turned))
+    there = direction * 30.0 / degrees(elbow.units.count_rad)
+    assert values["centre_count"] == pytest.approx(centre - there, abs=0.01)
 
 
+@both
 def test_a_joint_that_was_not_turned_has_no_direction(bench: ServoBench, line: ServoBus) -> None:
-    with pytest.raises(RefusedError, match=r"was turned by 1\.5 degrees only"):
-        tools.calibrate(line, ELBOW, 0.0, by_hand(bench, 600, 605))
+    said = f"was turned by {degrees(5 * bench.units.count_rad):.1f} degrees only"
+    with pytest.raises(RefusedError, match=said):
+        tools.calibrate(line, bench.robot.joints["elbow"], 0.0, by_hand(bench, 600, 605))
 
 
+@pytest.mark.parametrize("bench", ["feetech"], indirect=True)
+def test_a_calibrated_servo_passes_no_end_of_its_range_and_remembers_it(bench: ServoBench, line: ServoBus) -> None:
+    elbow = bench.robot.joints["elbow"]
+    turn = by_hand(bench, 4050, 4140)  # from the last positions to the first ones
+    with pytest.raises(RefusedError, match="elbow passed the end of its servo's range"):
+        tools.feel_limits(line, elbow, lambda: bool(turn("")), print)
+    tools.calibrate(line, elbow, 0.0, by_hand(bench, 4090, 4200))
+    bench.call(bench.servo(5).power_up)
+    assert line.reading(5).position == 2048 + 110
+
+
+@both
 def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: ServoBench, line: ServoBus) -> None:
     turn = by_hand(bench, 300, 800)
     turns = iter([True, True, False])  # two ends, then a pause before Return is pressed
@@ -114,11 +159,13 @@ def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: Servo
             turn("")
         return turned is None
 
-    limits = tools.feel_limits(line, ELBOW, done, told)
-    first, last = (degrees(ELBOW.to_angle(count)) for count in (300, 800))
+    elbow = bench.robot.joints["elbow"]
+    limits = tools.feel_limits(line, elbow, done, told)
+    first, last = (degrees(elbow.to_angle(count)) for count in (300, 800))
     assert limits == pytest.approx((first + 2.0, last - 2.0), abs=0.1)
-    low, high = tools.write_limits(line, ELBOW, limits)
-    assert (bench.servo(5).get(6), bench.servo(5).get(8)) == (low, high)
+    low, high = tools.write_limits(line, elbow, limits)
+    bench.call(bench.servo(5).power_up)
+    assert (bench.get(5, "low_limit"), bench.get(5, "high_limit")) == (low, high)
     assert 300 < low < high < 800
 
 
@@ -205,20 +252,45 @@ def test_mistakes_get_one_line(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("bench", ["feetech"], indirect=True)
+def test_a_scan_writes_what_protocol_it_found_and_the_other_commands_speak_it(
+    bench: ServoBench, profile: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tools, "SCAN_S", 0.1)
+    monkeypatch.setattr(tools, "candidates", list)
+    arguments = ["servos", "scan", "--profile", str(profile), "--baud", "1000000", "--last", "9"]
+    assert main([*arguments, "--write", str(profile)]) == 0
+    assert "its protocol, feetech, is written to" in capsys.readouterr().out
+    robot = Robot.load(override=profile.with_name("robbie-measured.toml"))
+    assert {row.protocol for row in robot.networks.values()} == {"feetech"}
+    monkeypatch.setattr("builtins.input", by_hand(bench, 600, 500))
+    assert main(["servos", "calibrate", "elbow", "--profile", str(profile)]) == 0
+    assert "elbow: direction = -1, centre_count = 2048" in capsys.readouterr().out
+    assert main(["servos", "set-id", "5", "15", "--port", bench.port("arm")]) == 0
+    assert bench.call(lambda: bench.get(15, "id")) == 15
+
+
 # --- the doctor -------------------------------------------------------------------------------------
 
 
+@both
 def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
     config = ServosConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
-    assert {check.state for check in check_servos(config, ROBOT, "robbie")} == {"ok"}
+    assert {check.state for check in check_servos(config, bench.robot, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
-    for number, registers in {5: {5: 250}, 4: {43: 75}, 3: {42: 70}}.items():
-        bench.put(number, registers)
-    texts = {check.name: check.text for check in check_servos(config, ROBOT, "robbie") if check.state == "bad"}
+    bench.put(5, return_delay=250)
+    bench.put(4, temperature=75)
+    bench.put(3, voltage=180)
+    bench.put(2, **WHEEL[bench.family.protocol])
+    texts = {check.name: check.text for check in check_servos(config, bench.robot, "robbie") if check.state == "bad"}
     assert "answers after 500 us" in texts["servo 5, elbow"]
     assert "let it cool" in texts["servo 4, shoulder"]
     assert "bad voltage" in texts["servo 3, arm_base"]
+    assert "is set up as a wheel" in texts["servo 2, neck_tilt"]
     assert "does not answer at 1000000 baud" in texts["servo 9, claw_right"]
+    other = bench.robot.with_networks(protocol={"dynamixel": "feetech", "feetech": "dynamixel"}[bench.family.protocol])
+    checks = check_servos(config, other, "robbie")
+    assert f"it speaks {bench.family.protocol}, but" in next(one.text for one in checks if one.name == "servo 5, elbow")
 
 
 def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:

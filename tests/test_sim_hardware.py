@@ -9,16 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.differential import command_of
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
+from cocoro.servo_units import UNITS
 from sim.base import Bumper, MobileBase
 from sim.realism import Wander
 from sim.seeds import stream
 from sim.servos import Backlash, SimServo, SimServoNetwork
 
 ROBOT = Robot.load()
+COUNT_RAD = UNITS["dynamixel"].count_rad
 HZ = 240
 MS = 1_000_000
 
@@ -45,8 +46,8 @@ def test_goals_and_positions_come_in_counts(angle_rad: float) -> None:
     one = servo()
     one.command(angle_rad, 1.0, until_ns=0)
     one.sense(angle_rad, 0.0, 0.0, now_ns=0)
-    assert abs(one.drive().target_rad - angle_rad) <= SERVO_COUNT_RAD / 2 + 1e-9
-    assert abs(one.position_rad - angle_rad) <= SERVO_COUNT_RAD / 2 + 1e-9
+    assert abs(one.drive().target_rad - angle_rad) <= COUNT_RAD / 2 + 1e-9
+    assert abs(one.position_rad - angle_rad) <= COUNT_RAD / 2 + 1e-9
     assert one.joint.to_count(one.position_rad) == one.count
 
 
@@ -54,7 +55,7 @@ def test_goals_stay_within_the_joints_limits_and_speeds_within_the_servos() -> N
     one = servo("shoulder")
     one.command(-3.0, 100.0, until_ns=0)
     low, _ = one.joint.limits_rad
-    assert one.drive().target_rad == pytest.approx(low, abs=SERVO_COUNT_RAD)
+    assert one.drive().target_rad == pytest.approx(low, abs=COUNT_RAD)
     assert one.drive().max_speed_radps == one.joint.max_speed_radps
     assert one.drive().max_torque_nm == one.joint.torque_nm
 
@@ -65,7 +66,7 @@ def test_the_slowest_command_still_moves_and_speed_zero_holds() -> None:
     assert 0.0 < one.drive().max_speed_radps < 0.02
     one.sense(0.5, 1.0, 0.0, now_ns=0)
     one.command(1.0, 0.0, until_ns=0)
-    assert one.drive().target_rad == pytest.approx(0.5, abs=SERVO_COUNT_RAD)
+    assert one.drive().target_rad == pytest.approx(0.5, abs=COUNT_RAD)
 
 
 def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
@@ -73,10 +74,10 @@ def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
     arm.command(order(1.0), now_ns=0)
     arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=200 * MS)
     arm.expire(200 * MS)
-    assert arm.servos["elbow"].drive().target_rad == pytest.approx(1.0, abs=SERVO_COUNT_RAD)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(1.0, abs=COUNT_RAD)
     arm.expire(201 * MS)
     held = arm.servos["elbow"].drive().target_rad
-    assert held == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert held == pytest.approx(0.3, abs=COUNT_RAD)
     # Only once: the goal does not follow the joint when something pushes it.
     arm.servos["elbow"].sense(0.2, 0.0, 0.0, now_ns=300 * MS)
     arm.expire(300 * MS)
@@ -90,8 +91,8 @@ def test_a_joint_that_is_not_named_any_more_expires_though_others_are() -> None:
     for tick in range(1, 20):
         arm.command(order(0.5, joint="neck_pan"), now_ns=tick * 20 * MS)
         arm.expire(tick * 20 * MS)
-    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
-    assert arm.servos["neck_pan"].drive().target_rad == pytest.approx(0.5, abs=SERVO_COUNT_RAD)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=COUNT_RAD)
+    assert arm.servos["neck_pan"].drive().target_rad == pytest.approx(0.5, abs=COUNT_RAD)
 
 
 def test_the_hand_keeps_its_goal_when_commands_stop_and_when_stopped() -> None:
@@ -110,12 +111,12 @@ def test_a_stopped_arm_holds_and_refuses_and_says_why(latch: str, why: str) -> N
     arm.command(order(1.0), now_ns=0)
     arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=0)
     arm.set_latch(latch)  # type: ignore[arg-type]
-    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=COUNT_RAD)
     assert arm.command(order(1.0), now_ns=MS) == why
     assert arm.state(MS).stopped_by == why
     assert arm.state(MS).latch == latch
     arm.set_latch("released")
-    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=COUNT_RAD)
     assert arm.command(order(1.0), now_ns=2 * MS) == ""
 
 
@@ -123,7 +124,7 @@ def test_a_command_for_a_joint_of_another_network_is_refused_whole() -> None:
     arm = network()
     command = ServoCommand(joints=("elbow", "claw_left"), goal_rad=(1.0, 1.0), speed_radps=(1.0, 1.0))
     assert "claw_left" in arm.command(command, now_ns=0)
-    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.0, abs=SERVO_COUNT_RAD)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.0, abs=COUNT_RAD)
 
 
 def test_pushing_at_the_limit_for_long_is_an_overload_until_it_is_reset() -> None:
@@ -183,7 +184,7 @@ def test_the_reading_is_never_further_off_than_half_the_backlash(angles_rad: lis
     one = servo(backlash_rad=radians(0.5))
     for angle_rad in angles_rad:
         one.sense(angle_rad, 0.0, 0.0, now_ns=0)
-        assert abs(one.position_rad - angle_rad) <= radians(0.25) + SERVO_COUNT_RAD / 2 + 1e-9
+        assert abs(one.position_rad - angle_rad) <= radians(0.25) + COUNT_RAD / 2 + 1e-9
 
 
 def test_without_backlash_the_servo_drives_the_joint_to_its_goal_and_with_it_the_reading() -> None:

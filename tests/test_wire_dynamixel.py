@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.dynamixel import EmulatedDynamixel
+from sim.wire.servo import EmulatedServo, EmulatedServoBus
 
 BAUD = 1_000_000
 MS = 1_000_000
@@ -27,17 +28,17 @@ class Wire:
 
 
 def test_the_manuals_read_of_the_temperature() -> None:
-    servo = EmulatedServo(1)
+    servo = EmulatedDynamixel(1)
     servo.put(43, 32)
     assert Wire(servo).say(bytes.fromhex("FF FF 01 04 02 2B 01 CC")) == bytes.fromhex("FF FF 01 03 00 20 DB")
 
 
 def test_the_manuals_ping() -> None:
-    assert Wire(EmulatedServo(1)).say(bytes.fromhex("FF FF 01 02 01 FB")) == bytes.fromhex("FF FF 01 02 00 FC")
+    assert Wire(EmulatedDynamixel(1)).say(bytes.fromhex("FF FF 01 02 01 FB")) == bytes.fromhex("FF FF 01 02 00 FC")
 
 
 def test_the_manuals_sync_write_moves_four_servos_and_nobody_answers() -> None:
-    wire = Wire(*(EmulatedServo(number) for number in range(4)))
+    wire = Wire(*(EmulatedDynamixel(number) for number in range(4)))
     data = "FF FF FE 18 83 1E 04 00 10 00 50 01 01 20 02 60 03 02 30 00 70 01 03 20 02 80 03 12"
     assert wire.say(bytes.fromhex(data)) == b""
     moves = [(servo.get(30), servo.get(32)) for servo in wire.bus.servos]
@@ -45,14 +46,14 @@ def test_the_manuals_sync_write_moves_four_servos_and_nobody_answers() -> None:
 
 
 def test_a_wrong_checksum_is_answered_as_such_and_not_obeyed() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     answer = wire.say(packet(1, 3, 25, 1)[:-1] + b"\x00")
     assert answer[4] == 0x10
     assert wire.bus.servos[0].get(25) == 0
 
 
 def test_read_only_and_out_of_range_are_refused_whole() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     servo = wire.bus.servos[0]
     assert wire.say(packet(1, 3, 36, 0, 1))[4] == 0x08
     assert wire.say(packet(1, 3, 24, 1, 2))[4] == 0x08  # the LED knows 0 and 1
@@ -63,14 +64,14 @@ def test_read_only_and_out_of_range_are_refused_whole() -> None:
 
 
 def test_a_goal_written_to_a_limp_servo_makes_it_hold() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     assert not wire.bus.servos[0].motor.on
     wire.say(packet(1, 3, 30, 0, 1))
     assert wire.bus.servos[0].motor.on
 
 
 def test_registered_writes_wait_for_the_action() -> None:
-    wire = Wire(EmulatedServo(1), EmulatedServo(2))
+    wire = Wire(EmulatedDynamixel(1), EmulatedDynamixel(2))
     wire.say(packet(1, 4, 25, 1))
     wire.say(packet(2, 4, 25, 1))
     assert [servo.get(25) for servo in wire.bus.servos] == [0, 0]
@@ -79,7 +80,7 @@ def test_registered_writes_wait_for_the_action() -> None:
 
 
 def test_an_overload_lets_go_until_the_torque_limit_is_written_again() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     servo = wire.bus.servos[0]
     servo.put(24, 1)
     for tick in range(60):
@@ -92,7 +93,7 @@ def test_an_overload_lets_go_until_the_torque_limit_is_written_again() -> None:
 
 @pytest.mark.parametrize(("address", "value", "bit"), [(42, 50, 0x01), (43, 100, 0x04)])
 def test_voltage_and_heat_show_in_every_answer(address: int, value: int, bit: int) -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     wire.bus.servos[0].put(address, value)
     answer = wire.say(packet(1, 1))
     if address == 42:
@@ -103,7 +104,7 @@ def test_voltage_and_heat_show_in_every_answer(address: int, value: int, bit: in
 
 
 def test_baud_id_and_return_delay_are_what_the_registers_say() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     wire.say(packet(1, 3, 3, 7))
     assert wire.say(packet(1, 1)) == b""
     wire.say(packet(7, 3, 4, 34))  # 57142
@@ -116,7 +117,7 @@ def test_baud_id_and_return_delay_are_what_the_registers_say() -> None:
 
 
 def test_two_of_one_id_talk_over_each_other() -> None:
-    one, other = EmulatedServo(1), EmulatedServo(1)
+    one, other = EmulatedDynamixel(1), EmulatedDynamixel(1)
     one.put(43, 0x0F)
     other.put(43, 0xF0)
     answer = Wire(one, other).say(packet(1, 2, 43, 1))
@@ -125,7 +126,7 @@ def test_two_of_one_id_talk_over_each_other() -> None:
 
 
 def test_rubbish_before_and_between_packets_is_passed_over() -> None:
-    wire = Wire(EmulatedServo(1))
+    wire = Wire(EmulatedDynamixel(1))
     assert wire.say(b"\x00\xff\x13" + packet(1, 1)) == packet(1, 0)
     assert wire.say(b"\xff\xff\xff" + packet(1, 1)[2:]) == packet(1, 0)
     assert wire.say(b"\xff\xff\x01\x09") == b""
@@ -134,7 +135,7 @@ def test_rubbish_before_and_between_packets_is_passed_over() -> None:
 
 
 def test_power_that_comes_back_finds_a_limp_servo_with_its_id() -> None:
-    servo = EmulatedServo(5)
+    servo = EmulatedDynamixel(5)
     servo.put(24, 1)
     servo.put(32, 50)
     servo.put(36, 300)

@@ -8,8 +8,8 @@ from math import hypot
 
 import pytest
 
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.robot import Robot
+from cocoro.servo_units import UNITS
 from sim.scene import Scene, load_scene
 from sim.service import SimConfig
 from sim.wire.firmware import Channel, LinkedPlant, MotorOrder, MotorOrders, PlantState, ServoSetup, Setup, firmware
@@ -19,6 +19,7 @@ from sim.world import World
 pytestmark = pytest.mark.sim
 
 ROBOT = Robot.load()
+COUNT_RAD = UNITS["dynamixel"].count_rad
 ELBOW = ROBOT.joints["elbow"].id
 DRIVING = 2
 
@@ -60,7 +61,7 @@ def test_a_servo_goes_to_the_goal_in_its_register_at_the_speed_in_its_register(
     start = elbow.count
     elbow.motor.goal, elbow.motor.speed, elbow.motor.slope = start + 200, 43, 2
     run(world, 0.5)
-    assert (elbow.count - start) * SERVO_COUNT_RAD == pytest.approx(0.5 * 0.5, abs=0.05)
+    assert (elbow.count - start) * COUNT_RAD == pytest.approx(0.5 * 0.5, abs=0.05)
     assert elbow.measurements[1] == pytest.approx(43, abs=5)
     run(world, 2.0)
     assert elbow.count == pytest.approx(start + 200, abs=3)

@@ -25,7 +25,7 @@ from world_operator import (
     yaw_of,
 )
 
-from cocoro.description import SERVO_COUNT_RAD
+from cocoro.servo_units import UNITS
 from sim.bullet import Bullet
 from sim.judge import Judge
 from sim.mechanism import Mechanism
@@ -82,7 +82,7 @@ def test_it_starts_parked_still_and_touching_nothing_but_the_floor(empty: World)
     assert truth.body_m == pytest.approx((0.0, 0.0, 0.0), abs=2e-4)
     for joint, angle_rad in truth.joints_rad.items():
         wanted = ROBOT.poses["park"].get(joint, 0.0)
-        assert angle_rad == pytest.approx(wanted, abs=SERVO_COUNT_RAD), joint
+        assert angle_rad == pytest.approx(wanted, abs=UNITS["dynamixel"].count_rad), joint
     assert empty.base_state().odometry_m == (0.0, 0.0)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from world_operator import COMMAND_EVERY, EMPTY, ROBOT, Operator, scene_with, yaw_of
 
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.messages import BaseCommand, ServoCommand
+from cocoro.servo_units import UNITS
 from sim.scene import Obstacle, load_scene
 from sim.world import World
 
@@ -110,7 +110,7 @@ def test_each_hardware_service_has_a_latch_of_its_own(empty: World) -> None:
     empty.set_latch("latched", "arm")
     operator.run(1.0, arm={"neck_pan": 1.0}, hand={"wrist_roll": -0.5}, wheels_mps=(-0.2, -0.2))
     truth = empty.truth()
-    assert truth.joints_rad["neck_pan"] == pytest.approx(0.0, abs=SERVO_COUNT_RAD)
+    assert truth.joints_rad["neck_pan"] == pytest.approx(0.0, abs=UNITS["dynamixel"].count_rad)
     assert truth.joints_rad["wrist_roll"] < -0.4
     assert truth.body_m[0] < -0.15
     assert [empty.servo_state(name).stopped_by for name in ("arm", "hand")] == ["estop", ""]

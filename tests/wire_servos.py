@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -12,10 +12,15 @@ from typing import TypeVar
 from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import Latch, ServoCommand, ServoState
+from cocoro.robot import Robot
+from cocoro.servo_units import UNITS, Protocol
 from cocoro.testing import ServiceUnderTest
 from cocoro.topics import Topic
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from services.servos.bus import ServoBus
+from services.servos.families import FAMILIES
 from sim.wire.emulator import Emulator, SimplePlant
+from sim.wire.models import model_of, servo_of
+from sim.wire.servo import EmulatedServo, EmulatedServoBus
 
 T = TypeVar("T")
 
@@ -24,16 +29,22 @@ LONG_S = 30.0
 REPLY_S = 0.2
 """Time limit for answers on a busy machine."""
 ARM, HAND = (1, 2, 3, 4, 5, 6), (7, 8, 9)
+WHEEL = {"dynamixel": {"low_limit": 0, "high_limit": 0}, "feetech": {"mode": 1}}
+"""By protocol, the registers with which a servo turns endlessly."""
 STATE: dict[str, Topic[ServoState]] = {"arm": topics.ARM_STATE, "hand": topics.HAND_STATE}
 COMMAND: dict[str, Topic[ServoCommand]] = {"arm": topics.ARM_COMMAND, "hand": topics.HAND_COMMAND}
 
 
 class ServoBench:
-    """Two emulated lines with the Calliope's servos and a plant without physics; a context manager."""
+    """Two emulated lines with a Calliope's servos, of one family, and a plant without physics; a context manager."""
 
-    def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0) -> None:
-        self.arm = EmulatedServoBus([EmulatedServo(number, 28, overload_s) for number in ARM])
-        self.hand = EmulatedServoBus([EmulatedServo(number, 12, overload_s) for number in HAND])
+    def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0, protocol: Protocol = "dynamixel") -> None:
+        self.family, self.units = FAMILIES[protocol], UNITS[protocol]
+        self.robot = Robot.load().with_networks(protocol=protocol)
+        self.arm, self.hand = (
+            EmulatedServoBus([servo_of(model_of(name, protocol), number, overload_s) for number in numbers])
+            for name, numbers in (("arm", ARM), ("hand", HAND))
+        )
         self.body = SimplePlant(None, self.arm, self.hand)
         self.emulator = Emulator(folder, {"arm": self.arm, "hand": self.hand}, self.body, seed)
         self.folder = folder
@@ -51,14 +62,34 @@ class ServoBench:
     def servo(self, number: int) -> EmulatedServo:
         return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
 
-    def put(self, number: int, registers: Mapping[int, int]) -> None:
-        """Set registers of a servo, by address, between two packets."""
+    def bus(self, name: str = "arm", reply_s: float = REPLY_S, baud: int = 1_000_000) -> ServoBus:
+        """A driver of a line."""
+        return ServoBus(self.port(name), baud, reply_s, self.family)
+
+    def put(self, number: int, **registers: int) -> None:
+        """Set registers of a servo between two packets."""
 
         def put() -> None:
-            for address, value in registers.items():
-                self.servo(number).put(address, value)
+            for name, value in registers.items():
+                self.servo(number).put(self.at(name), value)
 
         self.emulator.call(put)
+
+    def at(self, register: str) -> int:
+        """The address of a register."""
+        return self.family.registers[register].address
+
+    def get(self, number: int, register: str) -> int:
+        return self.servo(number).get(self.at(register))
+
+    def count(self, joint: str, angle_rad: float) -> int:
+        return self.robot.joints[joint].to_count(angle_rad)
+
+    def tireless(self, number: int) -> None:
+        """Let a servo push for ever."""
+        self.servo(number).overload_s = 1000.0
+        if "overload_torque" in self.family.registers:
+            self.put(number, overload_torque=254)
 
     def call(self, job: Callable[[], T]) -> T:
         return self.emulator.call(job)
@@ -129,15 +160,22 @@ def angle(state: ServoState, joint: str) -> float:
 
 
 @asynccontextmanager
-async def moved(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
-    """The servo service on both lines, all servos inspected, the emergency stop released."""
+async def inspected(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
+    """The servo service on both lines, all servos read, the emergency stop released."""
     settings = {"arm_port": bench.port("arm"), "hand_port": bench.port("hand"), "reply_s": REPLY_S} | config
-    async with ServiceUnderTest("services.servos.service", settings, clock=RealClock()) as service:
+    async with ServiceUnderTest("services.servos.service", settings, robot=bench.robot, clock=RealClock()) as service:
         servos = Moved(bench, service)
         await servos.state("arm", lambda state: len(state.joints) == len(ARM))
         await servos.state("hand", lambda state: len(state.joints) == len(HAND))
         servos.release()
+        yield servos
+        servos.silence()
+
+
+@asynccontextmanager
+async def moved(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
+    """The same, and all servos hold."""
+    async with inspected(bench, **config) as servos:
         for network in ("arm", "hand"):
             await servos.state(network, lambda state: state.torque_enabled and all(state.torque_enabled))
         yield servos
-        servos.silence()

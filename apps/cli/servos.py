@@ -39,6 +39,7 @@ from deploy.processes import named
 from deploy.profiles import Profile
 from services.servos import tools
 from services.servos.bus import ServoBus
+from services.servos.families import FAMILIES
 
 NETWORKS = ("arm", "hand")
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
@@ -189,9 +190,8 @@ class ServoWorkbench:
     @contextmanager
     def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
         """Opens the serial line that the joint's servo is on."""
-        with ServoBus(
-            port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, REPLY_S
-        ) as line:
+        row = self.robot.networks[joint.network]
+        with ServoBus(port or self.ports[joint.network], baud or row.baud, REPLY_S, FAMILIES[row.protocol]) as line:
             yield line
 
     def write(self, joint: Joint, values: dict[str, Any]) -> None:
@@ -264,9 +264,10 @@ def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
 
 
 def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint], file: Path) -> None:
-    """Writes each network's port into a profile, and a baud rate that differs into the robot's measured file."""
+    """Writes each network's port into a profile, and what differs of baud rate and protocol into the measured file."""
     for network, row in bench.robot.networks.items():
-        places = {(one.port, one.baud) for one in found if one.number in names and names[one.number].network == network}
+        own = [one for one in found if one.number in names and names[one.number].network == network]
+        places = {(one.port, one.baud, one.protocol) for one in own}
         if not places:
             continue
         if len(places) > 1:
@@ -274,13 +275,16 @@ def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint
                 f"the servos of {network} are on several lines ({sorted(places)}), so no port was written; connect"
                 " them to one line, or write the profile by hand"
             )
-        port, baud = places.pop()
+        port, baud, protocol = places.pop()
         print(f"{network}_port = {port}, {baud} baud", flush=True)
         write_values(file, "service.servos", {f"{network}_port": port})
         print(f"the port is written to {file}")
         if baud != row.baud:
             write_values(bench.file, f"network.{network}", {"baud": baud})
             print(f"the baud rate is written to {bench.file}")
+        if protocol != row.protocol:
+            write_values(bench.file, f"network.{network}", {"protocol": protocol})
+            print(f"its protocol, {protocol}, is written to {bench.file}")
 
 
 @servos.command("set-id")

@@ -42,7 +42,7 @@ def fingerprint_of(robot: Robot) -> str:
     data = robot.to_data()
     geometry = {
         "link": data["link"],
-        "joint": [(row["name"], row["direction"], row["centre_count"]) for row in data["joint"]],
+        "joint": [(one.name, one.direction, one.centre_count) for one in robot.joints.values()],
         "marker": data["marker"],
         "base": [data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m")],
         "kinect": {

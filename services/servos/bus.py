@@ -1,9 +1,12 @@
-"""A serial line with servos on it (Dynamixel Protocol 1.0), through the Dynamixel SDK. It blocks: call it from a
-thread.
+"""A serial line with servos of one family on it, through the Dynamixel SDK. It blocks: call it from a thread.
 
 The SDK writes the instructions. `CheckedPort` replaces its reading: only valid answers of the asked servo reach it. A
 status packet is `FF FF ID LENGTH ERROR data CHECKSUM` with LENGTH = bytes of data + 2 and CHECKSUM = inverted sum from
-ID on (ROBOTIS AX-12 manual).
+ID on (ROBOTIS AX-12 manual, Dynamixel Protocol 1.0; Feetech's protocol manual: the same packets and instructions).
+
+So one SDK serves both families. Feetech's own, `ftservo-python-sdk` (MIT, maintained by the maker) and its older copy
+`feetech-servo-sdk`, write the same bytes and have the port that `CheckedPort` is there to replace: it polls without
+pause and goes by the wall clock. Both install one module of the same name.
 """
 
 from __future__ import annotations
@@ -22,8 +25,8 @@ from dynamixel_sdk.protocol1_packet_handler import Protocol1PacketHandler
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from cocoro.errors import CocoroError
-from services.servos import table
-from services.servos.table import REFUSALS, REGISTERS, ServoReading
+from services.servos.dynamixel import DYNAMIXEL
+from services.servos.family import READING_LENGTH, ServoFamily, ServoReading
 
 HEADER = b"\xff\xff"
 BROADCAST = 254
@@ -38,12 +41,12 @@ class Status(NamedTuple):
     data: bytes
 
 
-def find_status(stream: bytes, number: int, length: int) -> Status | None:
+def find_status(stream: bytes, number: int, length: int, refusals: int) -> Status | None:
     """Find the answer of servo `number` to a request for `length` bytes; None when there is none yet.
 
     A packet is valid when its number, length and checksum are right. When data were requested, a packet without data is
-    valid only if its error bits say that the servo refuses. Everything else is skipped byte by byte, so that a broken
-    packet cannot hide a good one.
+    valid only if its error has one of the bits `refusals`: the servo refuses. Everything else is skipped byte by byte,
+    so that a broken packet cannot hide a good one.
     """
     at = stream.find(HEADER)
     while at >= 0:
@@ -53,7 +56,7 @@ def find_status(stream: bytes, number: int, length: int) -> Status | None:
                 continue
             if ~sum(packet[2:-1]) & 0xFF != packet[-1]:
                 continue
-            if size == length or packet[4] & REFUSALS:
+            if size == length or packet[4] & refusals:
                 return Status(packet, packet[4], packet[5:-1])
         at = stream.find(HEADER, at + 1)
     return None
@@ -81,6 +84,8 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
         super().__init__(path)
         self.baudrate = baud
         self.timeout_s = timeout_s
+        self.refusals = 0
+        """The error bits with which a servo refuses; see `find_status`."""
         self.strays = 0
         """Count of bytes that were not part of an answer."""
         self._stream = bytearray()
@@ -136,7 +141,7 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
             if not data:
                 raise serial.SerialException("the adapter is gone")
             self._stream += data
-            found: Status | None = find_status(bytes(self._stream), number, length)
+            found: Status | None = find_status(bytes(self._stream), number, length, self.refusals)
             if found is not None:
                 self._ready = found.packet
                 self.strays += len(self._stream) - len(found.packet)
@@ -174,10 +179,11 @@ class PortError(CocoroError):
 class ServoBus:
     """A context manager. Every method raises PortError when the line fails; the bus is unusable afterwards."""
 
-    def __init__(self, path: str, baud: int, timeout_s: float = REPLY_S) -> None:
+    def __init__(self, path: str, baud: int, timeout_s: float = REPLY_S, family: ServoFamily = DYNAMIXEL) -> None:
         self.path = path
         self._sdk = Protocol1PacketHandler()
         self._port = CheckedPort(path, baud, timeout_s)
+        self.family = family
         try:
             self._port.openPort()
         except (OSError, ValueError, termios.error) as error:
@@ -194,6 +200,16 @@ class ServoBus:
             self._port.closePort()
 
     @property
+    def family(self) -> ServoFamily:
+        """Whose registers it reads and writes. A tool that meets servos of any family changes it."""
+        return self._family
+
+    @family.setter
+    def family(self, family: ServoFamily) -> None:
+        self._family = family
+        self._port.refusals = family.refusals
+
+    @property
     def strays(self) -> int:
         """Count of received bytes that were not part of an answer: noise, and damaged or late packets."""
         return self._port.strays
@@ -207,10 +223,10 @@ class ServoBus:
 
     def read(self, number: int, register: str) -> int:
         """Read a register. Raises SilentError or RefusedWriteError."""
-        row = REGISTERS[register]
+        row = self.family.registers[register]
         data, error = self.read_block(number, row.address, row.size)
-        if error & REFUSALS:
-            raise RefusedWriteError(f"servo {number} refuses to read its {register}: {_error_names(error)}")
+        if error & self.family.refusals:
+            raise RefusedWriteError(f"servo {number} refuses to read its {register}: {self._refusals_in(error)}")
         return int.from_bytes(data, "little")
 
     def read_block(self, number: int, address: int, length: int) -> tuple[bytes, int]:
@@ -219,22 +235,23 @@ class ServoBus:
             data, result, error = self._sdk.readTxRx(self._port, number, address, length)
         except (OSError, ValueError) as fault:
             raise PortError(f"{self.path}: {_sentence(fault)}") from fault
-        if result != COMM_SUCCESS or (len(data) < length and not error & REFUSALS):
+        if result != COMM_SUCCESS or (len(data) < length and not error & self.family.refusals):
             raise SilentError(number)
         return bytes(data), error
 
     def reading(self, number: int) -> ServoReading:
         """Read what the servo measures now. Raises SilentError."""
-        data, error = self.read_block(number, table.FIRST, table.LENGTH)
-        found = table.reading(data, error, time.monotonic_ns()) if len(data) == table.LENGTH else None
+        data, error = self.read_block(number, self.family.registers["present_position"].address, READING_LENGTH)
+        found = self.family.reading(data, error, time.monotonic_ns()) if len(data) == READING_LENGTH else None
         if found is None:
             raise SilentError(number)
         return found
 
     def write(self, number: int, register: str, value: int) -> int:
         """Write a register; returns the error byte. Raises SilentError when it is not confirmed, RefusedWriteError when
-        it is refused, ValueError for a read-only register."""
-        row = REGISTERS[register]
+        it is refused, ValueError for a read-only register. What must keep its value without power is written by
+        `keep`."""
+        row = self.family.registers[register]
         if not row.writable:
             raise ValueError(f"register {register} is read-only")
         try:
@@ -245,26 +262,48 @@ class ServoBus:
             raise PortError(f"{self.path}: {_sentence(fault)}") from fault
         if result != COMM_SUCCESS:
             raise SilentError(number)
-        if error & REFUSALS:
-            raise RefusedWriteError(f"servo {number} refuses {value} for its {register}: {_error_names(error)}")
+        if error & self.family.refusals:
+            raise RefusedWriteError(f"servo {number} refuses {value} for its {register}: {self._refusals_in(error)}")
         return int(error)
+
+    def keep(self, number: int, register: str, value: int) -> None:
+        """Write a register so that it keeps its value without power, and read it. Raises SilentError, and
+        RefusedWriteError when it has another value."""
+        lock = self.family.lock
+        if lock:
+            self.write(number, lock, 0)
+        with suppress(SilentError):  # it may answer by its new ID already
+            self.write(number, register, value)
+        if register == "id" and self.ping(value) is not None:
+            number = value
+        if lock:
+            self.write(number, lock, 1)
+        if self.family.registers[register].kept and self.read(number, register) != value:
+            raise RefusedWriteError(f"servo {number} does not take {value} for its {register}")
+
+    def is_wheel(self, number: int) -> bool:
+        """Whether a servo turns endlessly at its speed, instead of going to its goal. Raises SilentError."""
+        address, length = self.family.block(self.family.modes[0], self.family.modes[-1])
+        data, _ = self.read_block(number, address, length)
+        if len(data) < length:
+            raise SilentError(number)
+        return self.family.is_wheel(data)
 
     def go(self, orders: Mapping[int, tuple[int, int]]) -> None:
         """Write goal position and moving speed (counts) of several servos by one sync write, which is not answered."""
         if not orders:
             return
-        row = REGISTERS["goal_position"]
+        address, length = self.family.block(self.family.orders[0], self.family.orders[-1])
         data: list[int] = []
         for number, (goal, speed) in orders.items():
-            data += [number, *goal.to_bytes(2, "little"), *speed.to_bytes(2, "little")]
+            data += [number, *self.family.order(goal, speed)]
         try:
-            self._sdk.syncWriteTxOnly(self._port, row.address, 4, data, len(data))
+            self._sdk.syncWriteTxOnly(self._port, address, length, data, len(data))
         except OSError as fault:
             raise PortError(f"{self.path}: {_sentence(fault)}") from fault
 
-
-def _error_names(error: int) -> str:
-    return ", ".join(table.errors_in(error & REFUSALS))
+    def _refusals_in(self, error: int) -> str:
+        return ", ".join(self.family.errors_in(error & self.family.refusals))
 
 
 def _sentence(error: Exception) -> str:

@@ -8,7 +8,9 @@ from cocoro.ports import check_port, port_path
 from cocoro.robot import Robot
 from services.servos import tools
 from services.servos.bus import PortError, ServoBus, SilentError
-from services.servos.network import HIGH_V, HOT_C, LOW_V
+from services.servos.families import FAMILIES
+from services.servos.family import ServoFamily
+from services.servos.network import HOT_C
 from services.servos.service import NETWORKS, ServosConfig
 
 __all__ = ["check"]
@@ -22,22 +24,29 @@ def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
         checks += checked
         if checked[0].state == "ok":
             joints = [robot.joints[joint] for joint in robot.network_joints(name)]
-            baud = robot.networks[name].baud
-            checks += _servos(name, port_path(port, robot_name), baud, joints, config.reply_s)
+            row = robot.networks[name]
+            with_port = name, port_path(port, robot_name)
+            checks += _servos(*with_port, row.baud, FAMILIES[row.protocol], joints, config.reply_s)
     return checks
 
 
-def _servos(name: str, path: str, baud: int, joints: list[Joint], reply_s: float) -> list[Check]:
+def _servos(name: str, path: str, baud: int, family: ServoFamily, joints: list[Joint], reply_s: float) -> list[Check]:
     try:
         with ServoBus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
-            return [_servo(bus, baud, joint) for joint in joints]
+            return [_servo(bus, baud, family, joint) for joint in joints]
     except PortError as error:
         return [note(f"{name} servos", f"{error}: does their service run? See `cocoro status`")]
 
 
-def _servo(bus: ServoBus, baud: int, joint: Joint) -> Check:
+def _servo(bus: ServoBus, baud: int, family: ServoFamily, joint: Joint) -> Check:
     what = f"servo {joint.id}, {joint.name}"
+    bus.family = family
     try:
+        if not tools.recognise(bus, joint.id):
+            raise SilentError(joint.id)
+        if bus.family != family:
+            kind, says = bus.family.protocol, family.protocol
+            return bad(what, f'it speaks {kind}, but the robot description says protocol = "{says}" of its network')
         found = tools.examine(bus, baud, joint.id)
     except SilentError:
         return bad(what, f"does not answer at {baud} baud: power, plugs, ID; `cocoro servos scan` finds it")
@@ -49,7 +58,9 @@ def _servo(bus: ServoBus, baud: int, joint: Joint) -> Check:
         wrong.append(
             f"answers after {found.return_delay_us} us: set that to 0 by `cocoro servos set-id {joint.id} {joint.id}`"
         )
-    if not LOW_V <= found.voltage_v <= HIGH_V:
+    if found.is_wheel:
+        wrong.append("is set up as a wheel: give it limits, or its mode 0, with its maker's program")
+    if not family.volts[0] <= found.voltage_v <= family.volts[1]:
         wrong.append("bad voltage: check the supply")
     if found.temperature_c >= HOT_C:
         wrong.append("hot: let it cool")

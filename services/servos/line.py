@@ -14,13 +14,11 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
-from typing import NamedTuple
 
-from services.servos import table
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
+from services.servos.family import ServoFamily, ServoReading
 from services.servos.motion import HOLD_RADPS
 from services.servos.network import MISSES, ServoStatus, ServoTask
-from services.servos.table import Register, ServoReading
 
 log = logging.getLogger("cocoro.servos")
 
@@ -31,20 +29,8 @@ CHECK_CYCLES = 8
 """Once in this many cycles the settings of one servo are checked."""
 ORDERS_S = 0.2
 """Orders expire when they are not renewed for this long, as when the event loop hangs."""
-_TORQUE, _SLOPE, _GOAL, _LIMIT = (
-    table.REGISTERS[name] for name in ("torque_enable", "cw_slope", "goal_position", "torque_limit")
-)
-STATE = _TORQUE.address, _LIMIT.address + _LIMIT.size - _TORQUE.address
-"""Address and length of the registers of a servo's state. It differs from that of a reading."""
-
-
-class _State(NamedTuple):
-    """The writable registers of a servo."""
-
-    torque: bool
-    slope: int
-    goal: int
-    limit: int
+STATE = "torque_enable", "torque_limit"
+"""The first and the last register of a servo's state. Its length differs from that of a reading."""
 
 
 @dataclass
@@ -66,14 +52,6 @@ class CycleResult:
     strays: int = 0
 
 
-@dataclass(frozen=True)
-class ServoSettings:
-    """Settings that are written before a servo is enabled."""
-
-    slope: int
-    torque_limit: int
-
-
 class ServoLine:
     """Calls `on_cycle(result)` in the event loop in which it was made. Call `start`, and `stop` at the end."""
 
@@ -81,14 +59,18 @@ class ServoLine:
         self,
         path: str,
         baud: int,
-        settings: Mapping[int, ServoSettings],
+        family: ServoFamily,
+        settings: Mapping[int, Mapping[str, int]],
         rate_hz: float,
         reply_s: float,
         on_cycle: Callable[[CycleResult], None],
         keeps_goal: bool = False,
     ) -> None:
-        """`keeps_goal`: when halted, servos still go to their last goal, so that the hand keeps its grip."""
-        self._open: Callable[[], ServoBus] = lambda: ServoBus(path, baud, reply_s)
+        """`settings`: by servo ID, the registers that are written before the servo is enabled. `keeps_goal`: when
+        halted, servos still go to their last goal, so that the hand keeps its grip."""
+        self._open: Callable[[], ServoBus] = lambda: ServoBus(path, baud, reply_s, family)
+        self._family = family
+        self._hold_speed = round(HOLD_RADPS / family.units.speed_radps)
         self._settings = settings
         self._period_s = 1.0 / rate_hz
         self._on_cycle = on_cycle
@@ -180,11 +162,10 @@ class ServoLine:
     def _hold(self, bus: ServoBus, readings: Mapping[int, ServoReading]) -> None:
         """Make the servos under orders hold where they were just read. A servo that does not answer follows in a later
         cycle. A line that keeps its goals holds nothing: it just takes no new goals."""
-        speed = round(HOLD_RADPS / table.SPEED_RADPS)
         ordered = () if self._keeps_goal else self._orders[1]
         new = [number for number in ordered if number in readings and number not in self._held]
         if new:
-            self._held |= {number: (readings[number].position, speed) for number in new}
+            self._held |= {number: (readings[number].position, self._hold_speed) for number in new}
             bus.go(self._held)
 
     def _to_read(self, now_s: float) -> Collection[int]:
@@ -224,25 +205,32 @@ class ServoLine:
     def _inspect(self, bus: ServoBus, number: int) -> ServoStatus:
         state = self._state(bus, number)
         reading = bus.reading(number)
-        if state.torque and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps with other settings
+        enabled = bool(state["torque_enable"])
+        if enabled and bus.is_wheel(number):
+            self._relax(bus, number)
+            enabled = False
+        if enabled and not reading.error & self._family.shutdowns:  # it holds already, but perhaps with other settings
             self._set(bus, number)
-        return ServoStatus(state.torque, state.goal, reading.position, reading.error)
+        return ServoStatus(enabled, state["goal_position"], reading.position, reading.error)
 
     def _set(self, bus: ServoBus, number: int) -> None:
-        setting = self._settings[number]
-        bus.write(number, "cw_slope", setting.slope)
-        bus.write(number, "ccw_slope", setting.slope)
-        bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
+        for register, value in self._settings[number].items():
+            bus.write(number, register, value)
 
     def _enable(self, bus: ServoBus, number: int) -> int:
         """Make a servo hold where it is; returns its position, counts. Speed and limits are written before anything
         that could make it move, and its goal is set to its position before its torque is switched on. The goal is read
-        back, since a late confirmation may belong to another instruction."""
-        bus.write(number, "moving_speed", round(HOLD_RADPS / table.SPEED_RADPS))
+        back, since a late confirmation may belong to another instruction. Raises RefusedWriteError for a wheel."""
+        if bus.is_wheel(number):
+            raise RefusedWriteError(f"servo {number} is set up as a wheel, which turns endlessly")
+        bus.write(number, "moving_speed", self._hold_speed)
         self._set(bus, number)
+        if bus.reading(number).error & self._family.shutdowns:
+            for register, value in self._family.revival.items():
+                bus.write(number, register, value)
         position = bus.reading(number).position
         bus.write(number, "goal_position", position)
-        if self._state(bus, number).goal != position:
+        if self._state(bus, number)["goal_position"] != position:
             raise SilentError(number)
         bus.write(number, "torque_enable", 1)
         return position
@@ -259,21 +247,24 @@ class ServoLine:
                 result.checked[number] = self._is_as_set(bus, number)
 
     def _is_as_set(self, bus: ServoBus, number: int) -> bool:
-        state, setting = self._state(bus, number), self._settings[number]
-        return (state.torque, state.slope, state.limit) == (True, setting.slope, setting.torque_limit)
+        state = self._state(bus, number)
+        return all(
+            state[register] == value for register, value in {"torque_enable": 1, **self._settings[number]}.items()
+        )
 
-    def _state(self, bus: ServoBus, number: int) -> _State:
-        """Read the writable registers of a servo. Always this whole block: an answer does not say what it answers, and
-        by its length a late one cannot be taken for the answer to another request, such as `ServoBus.reading`."""
-        data, _ = bus.read_block(number, *STATE)
-        if len(data) < STATE[1]:
+    def _state(self, bus: ServoBus, number: int) -> dict[str, int]:
+        """Read the registers of a servo that are written while it runs. Always this whole block: an answer does not say
+        what it answers, and by its length a late one cannot be taken for the answer to another request, such as
+        `ServoBus.reading`."""
+        address, length = self._family.block(*STATE)
+        data, _ = bus.read_block(number, address, length)
+        if len(data) < length:
             raise SilentError(number)
-
-        def value(register: Register) -> int:
-            at = register.address - STATE[0]
-            return int.from_bytes(data[at : at + register.size], "little")
-
-        return _State(bool(value(_TORQUE)), value(_SLOPE), value(_GOAL), value(_LIMIT))
+        return {
+            name: int.from_bytes(data[row.address - address : row.address - address + row.size], "little")
+            for name, row in self._family.registers.items()
+            if address <= row.address < address + length
+        }
 
     def _publish(self, result: CycleResult) -> None:
         with suppress(RuntimeError):  # the loop has ended

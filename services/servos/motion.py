@@ -6,16 +6,17 @@ commanded speed. So it moves as if it had the final goal, and stops by itself wh
 
 from __future__ import annotations
 
+from math import radians
+
 from cocoro.clock import NS
-from cocoro.description import SERVO_COUNT_RAD, Joint
-from services.servos import table
+from cocoro.description import Joint
 
 LEAD_S = 0.2
 REACH_RAD = 0.4
 """Upper bound for how far the point is ahead of the joint: more than any slope, so that a blocked joint pushes with its
 full torque limit, but so little that it does not leap when it comes free."""
-AT_GOAL_COUNTS = 2
-"""A joint this close to its goal has arrived: it is not stopped when its command expires."""
+AT_GOAL_RAD = radians(0.59)
+"""A joint this close to its goal, two counts of an AX-12, has arrived: it is not stopped when its command expires."""
 HOLD_RADPS = 1.0
 """Speed at which a joint that was pushed away returns to where it is held."""
 
@@ -65,7 +66,7 @@ class JointMotion:
             return None
         if self._until_ns is not None and now_ns > self._until_ns:
             self._until_ns = None
-            if not self._keeps_goal and abs(self.goal_rad - position_rad) > AT_GOAL_COUNTS * SERVO_COUNT_RAD:
+            if not self._keeps_goal and abs(self.goal_rad - position_rad) > AT_GOAL_RAD:
                 self.hold(position_rad)
         dt_s = 0.0 if self._then_ns is None else max(now_ns - self._then_ns, 0) / NS
         self._then_ns = now_ns
@@ -73,7 +74,8 @@ class JointMotion:
         self._point_rad = min(max(self._point_rad, position_rad - REACH_RAD), position_rad + REACH_RAD)
         ahead_rad = _towards(self._point_rad, self.goal_rad, self._speed_radps * LEAD_S)
         # 0 would mean full speed.
-        speed = min(max(round(self._speed_radps / table.SPEED_RADPS), 1), table.FASTEST)
+        units = self.joint.units
+        speed = min(max(round(self._speed_radps / units.speed_radps), 1), units.fastest)
         return self.joint.to_count(ahead_rad), speed
 
 

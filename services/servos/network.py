@@ -14,16 +14,14 @@ from cocoro.description import Joint
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
-from services.servos import table
-from services.servos.motion import AT_GOAL_COUNTS, JointMotion
-from services.servos.table import ServoReading
+from services.servos.family import ServoFamily, ServoReading
+from services.servos.motion import AT_GOAL_RAD, JointMotion
 
 MISSES = 3
 """A servo is silent after this many missing answers in a row."""
 STALE_NS = NS // 10
 """A reading is published until it is older than this, in case that the next answer is missing."""
 HOT_C = 60
-LOW_V, HIGH_V = 9.0, 16.0
 GRACE_NS = NS // 2
 """Time after it was enabled in which a servo may still report its last shutdown."""
 INTERRUPTED_NS = 30 * NS
@@ -89,12 +87,15 @@ class ServoJoint:
 class ServoNetwork:
     """All servos of a line. Every `now_ns` is the robot's clock."""
 
-    def __init__(self, joints: Iterable[Joint], *, keeps_goal: bool, timeout_s: float, max_age_s: float) -> None:
+    def __init__(
+        self, joints: Iterable[Joint], family: ServoFamily, *, keeps_goal: bool, timeout_s: float, max_age_s: float
+    ) -> None:
         """A command counts for `timeout_s` from its stamp, and is refused once it is older than `max_age_s`."""
         self.joints = {joint.id: ServoJoint(joint, keeps_goal=keeps_goal) for joint in joints}
         self.latch: LatchState = "unknown"
         self.port_fault = "the port was not opened yet"
         self._by_name = {one.joint.name: one for one in self.joints.values()}
+        self._family = family
         self._keeps_goal = keeps_goal
         self._timeout_ns = round(timeout_s * NS)
         self._max_age_s = max_age_s
@@ -220,7 +221,7 @@ class ServoNetwork:
             one.interrupted_ns = now_ns
         one.held = False
         if one.enabled:
-            resting = abs(status.goal - status.position) <= AT_GOAL_COUNTS * 4
+            resting = abs(status.goal - status.position) * one.joint.units.count_rad <= AT_GOAL_RAD * 4
             one.motion.hold(one.joint.to_angle(status.goal if self._keeps_goal or resting else status.position))
         self._enable_if_due(one)
 
@@ -230,7 +231,7 @@ class ServoNetwork:
         one = self.joints[number]
         if not one.obeys or as_set or number in self._tasks:
             return
-        if one.reading is not None and one.reading.error & table.SHUTDOWNS:  # it has shut down since
+        if one.reading is not None and one.reading.error & self._family.shutdowns:  # it has shut down since
             self._shut_down(one, one.reading.error)
             return
         one.interrupted_ns = now_ns
@@ -255,8 +256,8 @@ class ServoNetwork:
         self._fault(self.joints[task.number], why)
 
     def _shut_down(self, one: ServoJoint, error: int) -> None:
-        if error & table.SHUTDOWNS:
-            self._fault(one, " and ".join(table.errors_in(error & table.SHUTDOWNS)))
+        if error & self._family.shutdowns:
+            self._fault(one, " and ".join(self._family.errors_in(error & self._family.shutdowns)))
 
     def _fault(self, one: ServoJoint, what: str) -> None:
         if not one.fault:
@@ -296,12 +297,13 @@ class ServoNetwork:
         ]
         if not recent:
             return None
+        units = self._family.units
         return ServoState(
             stamp_ns=sum(read_ns for _, _, read_ns in recent) // len(recent),
             joints=tuple(one.joint.name for one, _, _ in recent),
             position_rad=tuple(one.joint.to_angle(reading.position) for one, reading, _ in recent),
-            speed_radps=tuple(one.joint.direction * reading.speed * table.SPEED_RADPS for one, reading, _ in recent),
-            load=tuple(one.joint.direction * reading.load / table.FULL_TORQUE for one, reading, _ in recent),
+            speed_radps=tuple(one.joint.direction * reading.speed * units.speed_radps for one, reading, _ in recent),
+            load=tuple(one.joint.direction * reading.load / units.full_torque for one, reading, _ in recent),
             temperature_c=tuple(float(reading.temperature_c) for _, reading, _ in recent),
             voltage_v=tuple(reading.voltage_v for _, reading, _ in recent),
             torque_enabled=tuple(one.enabled for one, _, _ in recent),
@@ -324,6 +326,7 @@ class ServoNetwork:
         found += [f"{name} does not answer" for name in self.silent_joints()]
         if damage := self._disturbed.total(now_ns):
             found.append(f"the line is disturbed, check its cables: {damage} damaged bytes in {WINDOW_S:g} s")
+        low_v, high_v = self._family.volts
         for one in self.joints.values():
             name = one.joint.name
             if one.relaxed:
@@ -334,6 +337,6 @@ class ServoNetwork:
                 continue
             if one.reading.temperature_c >= HOT_C:
                 found.append(f"{name} is hot: {one.reading.temperature_c} C")
-            if not LOW_V <= one.reading.voltage_v <= HIGH_V:
+            if not low_v <= one.reading.voltage_v <= high_v:
                 found.append(f"{name} has a bad voltage: {one.reading.voltage_v:.1f} V")
         return tuple(found)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from contextlib import AsyncExitStack
-from math import radians
 from typing import Annotated
 
 import msgspec
@@ -13,7 +12,6 @@ from msgspec import Meta
 
 from cocoro import topics
 from cocoro.component import Implementation
-from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.faults import FaultReporter
 from cocoro.latch import ServiceLatch
@@ -22,8 +20,8 @@ from cocoro.node import Node
 from cocoro.ports import port_path
 from cocoro.topics import Topic
 from cocoro.units import PositiveShare
-from services.servos import table
-from services.servos.line import CycleResult, ServoLine, ServoSettings
+from services.servos.families import FAMILIES
+from services.servos.line import CycleResult, ServoLine
 from services.servos.network import ServoNetwork
 
 NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
@@ -54,18 +52,15 @@ class NetworkService:
         keeps_goal = node.name == "hand"
         row = robot.networks[node.name]
         self._state, command = NETWORKS[node.name]
+        family = FAMILIES[row.protocol]
         self._network = ServoNetwork(
-            joints, keeps_goal=keeps_goal, timeout_s=row.command_timeout_s, max_age_s=command.max_age_s
+            joints, family, keeps_goal=keeps_goal, timeout_s=row.command_timeout_s, max_age_s=command.max_age_s
         )
-        settings = {
-            joint.id: ServoSettings(
-                slope=table.slope_of(radians(joint.compliance_deg) / SERVO_COUNT_RAD),
-                torque_limit=round(config.torque.get(joint.name, 1.0) * table.FULL_TORQUE),
-            )
-            for joint in joints
-        }
+        settings = {joint.id: family.settings(joint, config.torque.get(joint.name, 1.0)) for joint in joints}
         port = port_path(config.arm_port if node.name == "arm" else config.hand_port, node.robot_name)
-        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._on_cycle, keeps_goal)
+        self._line = ServoLine(
+            port, row.baud, family, settings, row.rate_hz, config.reply_s, self._on_cycle, keeps_goal
+        )
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
         ServiceLatch(node, self._latched, self._line.halt)

@@ -9,23 +9,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from math import degrees, radians
+from math import degrees, inf, pi, radians
 from typing import NamedTuple
 
 from serial.tools import list_ports
 
-from cocoro.description import SERVO_COUNT_RAD, Joint
+from cocoro.description import Joint
 from cocoro.errors import CocoroError, RefusedError
-from services.servos import table
+from cocoro.servo_units import Protocol
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
+from services.servos.families import FAMILIES
 
-BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600)
+BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600, 250_000, 128_000, 76_800, 38_400)
 """Baud rates, most common first."""
 SCAN_S = 0.02
 READINGS = 20
 MARGIN_DEG = 2.0
 """Margin between the measured ends of a joint and its limits."""
-TURNED_COUNTS = 20
+TURNED_RAD = radians(5.8)
 """A joint counts as turned by hand when its position changed by this much."""
 
 
@@ -35,12 +36,15 @@ class FoundServo(NamedTuple):
     port: str
     baud: int
     number: int
+    protocol: Protocol
     model: str
     return_delay_us: int
     position: int
     voltage_v: float
     temperature_c: int
     errors: tuple[str, ...]
+    is_wheel: bool
+    """Whether it turns endlessly, instead of going to a goal."""
 
 
 def candidates() -> list[str]:
@@ -60,43 +64,59 @@ def scan(
                 with ServoBus(port, baud, SCAN_S) as bus:
                     show(f"{port} at {baud} baud ...")
                     for number in wanted:
-                        if bus.ping(number) is not None:
+                        if recognise(bus, number):
                             yield examine(bus, baud, number)
             except PortError as error:
                 show(str(error))
                 break
 
 
+def recognise(bus: ServoBus, number: int) -> bool:
+    """Whether a servo answers as `number`. The bus then is of its family, or of the one that it was of when no family
+    knows the servo's model."""
+    at_first = bus.family
+    for bus.family in FAMILIES.values():
+        model = bus.ping(number)
+        if model is None:
+            break
+        if model in bus.family.models:
+            return True
+    bus.family = at_first
+    return model is not None
+
+
 def examine(bus: ServoBus, baud: int, number: int) -> FoundServo:
-    """Read the basic data of a servo. Raises SilentError."""
+    """Read the basic data of a servo of the bus's family. Raises SilentError."""
     model = bus.read(number, "model")
     reading = bus.reading(number)
     return FoundServo(
         bus.path,
         baud,
         number,
-        table.MODELS.get(model, f"model {model}"),
+        bus.family.protocol,
+        bus.family.models.get(model, f"model {model}"),
         2 * bus.read(number, "return_delay"),
         reading.position,
         reading.voltage_v,
         reading.temperature_c,
-        table.errors_in(reading.error),
+        bus.family.errors_in(reading.error),
+        bus.is_wheel(number),
     )
 
 
 def set_number(bus: ServoBus, old: int, new: int) -> None:
-    """Give a servo another ID, and a return delay of 0. Raises RefusedError when the new ID is taken, or when no servo
-    answers as the old one; two servos with one ID talk over each other, and seem silent."""
-    if bus.ping(old) is None:
+    """Give a servo of any family another ID, and a return delay of 0. Raises RefusedError when the new ID is taken, or
+    when no servo answers as the old one; two servos with one ID talk over each other, and seem silent."""
+    if not recognise(bus, old):
         raise RefusedError(f"no servo answers as {old}: is it alone on the line, powered, and at this baud rate?")
     if new != old:
         if bus.ping(new) is not None:
             raise RefusedError(f"there is a servo {new} on this line already; take it off first")
-        with suppress(SilentError):  # it may answer by its new ID already
-            bus.write(old, "id", new)
+        with suppress(SilentError, RefusedWriteError):  # whether it has it is asked next
+            bus.keep(old, "id", new)
         if bus.ping(new) is None:
             raise RefusedError(f"the servo does not answer as {new}; `cocoro servos scan` shows its ID")
-    bus.write(new, "return_delay", 0)
+    bus.keep(new, "return_delay", 0)
 
 
 def relax(bus: ServoBus, joint: Joint) -> None:
@@ -112,24 +132,30 @@ def position_of(bus: ServoBus, joint: Joint) -> float:
     for _ in range(READINGS):
         positions.append(bus.reading(joint.id).position)
         time.sleep(0.01)  # spread over time, so that an unsteady hand is noticed
-    if max(positions) - min(positions) > TURNED_COUNTS:
+    if (max(positions) - min(positions)) * joint.units.count_rad > TURNED_RAD:
         raise RefusedError(f"{joint.name} moved while it was measured; hold it still")
     return sum(positions) / len(positions)
 
 
 def calibrate(bus: ServoBus, joint: Joint, at_deg: float, prompt: Callable[[str], None]) -> dict[str, float | int]:
     """Measure a joint's zero and sense of rotation: the operator turns it to a known angle, then towards greater
-    angles. Returns the values for its [[joint]] row. Raises RefusedError when it was not turned or did not keep
-    still."""
+    angles. Returns the values for its [[joint]] row. Where the servo can, the known angle becomes the middle of its
+    range, so that its positions do not jump from the last to the first within the joint's limits. Raises RefusedError
+    when it was not turned or did not keep still."""
+    count_deg = degrees(joint.units.count_rad)
     relax(bus, joint)
     prompt(f"{joint.name}: turn it to {at_deg:g} degrees by hand, and hold it there")
     there = position_of(bus, joint)
+    if bus.family.centring is not None:
+        bus.keep(joint.id, *bus.family.centring)
+        relax(bus, joint)
+        there = position_of(bus, joint)
     prompt(f"{joint.name}: now turn it some way towards greater angles")
     turned = position_of(bus, joint) - there
-    if abs(turned) < TURNED_COUNTS:
-        raise RefusedError(f"{joint.name} was turned by {abs(turned) * degrees(SERVO_COUNT_RAD):.1f} degrees only")
+    if abs(turned) * joint.units.count_rad < TURNED_RAD:
+        raise RefusedError(f"{joint.name} was turned by {abs(turned) * count_deg:.1f} degrees only")
     direction = 1 if turned > 0 else -1
-    centre = there - direction * at_deg / degrees(SERVO_COUNT_RAD)
+    centre = there - direction * at_deg / count_deg
     return {"direction": direction, "centre_count": round(centre, 2)}
 
 
@@ -139,29 +165,31 @@ def feel_limits(
     """Measure the ends between which the operator turns a limp joint until `done`; returns limits in degrees, with a
     margin. Raises RefusedError when the joint was hardly turned."""
     relax(bus, joint)
-    low, high = 1023, 0
+    low, high = inf, -inf
     while not done():
         try:
             position = bus.reading(joint.id).position
         except SilentError:
             continue
+        if low <= high and min(abs(position - low), abs(position - high)) * joint.units.count_rad > pi:
+            raise RefusedError(f"{joint.name} passed the end of its servo's range; first calibrate it in its middle")
         if position < low or position > high:
             low, high = min(low, position), max(high, position)
             ends = sorted(degrees(joint.to_angle(count)) for count in (low, high))
             show(f"{joint.name}: {ends[0]:.1f} to {ends[1]:.1f} degrees")
-    if high - low < 2 * TURNED_COUNTS:
+    if not (high - low) * joint.units.count_rad >= 2 * TURNED_RAD:  # also when nothing was read
         raise RefusedError(f"{joint.name} was hardly turned; nothing is changed")
     first, last = sorted(degrees(joint.to_angle(count)) for count in (low, high))
     return round(first + MARGIN_DEG, 1), round(last - MARGIN_DEG, 1)
 
 
 def write_limits(bus: ServoBus, joint: Joint, limits_deg: tuple[float, float]) -> tuple[int, int]:
-    """Write a joint's limits into its servo, which then refuses goals beyond them; returns them in counts. Raises
+    """Write a joint's limits into its servo, which then goes to no goal beyond them; returns them in counts. Raises
     CocoroError when the servo does not confirm."""
     ends = sorted(joint.to_count(radians(limit)) for limit in limits_deg)
     try:
-        bus.write(joint.id, "cw_limit", ends[0])
-        bus.write(joint.id, "ccw_limit", ends[1])
+        bus.keep(joint.id, "low_limit", ends[0])
+        bus.keep(joint.id, "high_limit", ends[1])
     except (SilentError, RefusedWriteError) as error:
         raise CocoroError(f"{joint.name}: {error}") from error
     return ends[0], ends[1]

@@ -15,10 +15,9 @@ from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from sim.wire.control import Control, ControlServer
 from sim.wire.create import EmulatedCreate
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
 from sim.wire.emulator import Emulator, SimplePlant
-
-MODELS = {"arm": 28, "hand": 12}
+from sim.wire.models import model_of, servo_of
+from sim.wire.servo import EmulatedServoBus
 
 
 def main() -> int:
@@ -36,8 +35,11 @@ def main() -> int:
         parser.error(str(error))
     create = EmulatedCreate()
     buses = {
-        name: EmulatedServoBus([EmulatedServo(robot.joints[joint].id, model) for joint in robot.network_joints(name)])
-        for name, model in MODELS.items()
+        name: EmulatedServoBus(
+            servo_of(model_of(name, network.protocol), joint.id, joint.overload_s)
+            for joint in (robot.joints[row] for row in robot.network_joints(name))
+        )
+        for name, network in robot.networks.items()
     }
     emulator = Emulator(folder, {"create": create, **buses}, SimplePlant(create, *buses.values()))
     with ControlServer(folder, Control(emulator)), suppress(KeyboardInterrupt):

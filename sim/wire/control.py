@@ -17,9 +17,9 @@ import msgspec
 from cocoro.clock import NS
 from cocoro.units import Share
 from sim.wire.create import EmulatedCreate
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
 from sim.wire.emulator import Emulator, Line
 from sim.wire.line import Direction, FaultKind, LineFault
+from sim.wire.servo import EmulatedServo, EmulatedServoBus
 
 SOCKET = "control"
 
@@ -145,16 +145,7 @@ class Control:
             create = self._create
             state["create"] = {"mode": create.mode, "wheels": create.wheels_mmps, "acted": list(create.acted)}
             create.acted.clear()
-        state["servos"] = {
-            servo.number: {
-                "position": servo.get(36),
-                "goal": servo.get(30),
-                "torque": servo.get(24),
-                "torque_limit": servo.get(34),
-                "error": servo.error,
-            }
-            for servo in self._servos
-        }
+        state["servos"] = {servo.number: servo.looks for servo in self._servos}
         for servo in self._servos:
             servo.acted.clear()
         return state

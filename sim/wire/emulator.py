@@ -17,8 +17,8 @@ from typing import Protocol, TypeVar
 
 from cocoro.clock import NS
 from sim.wire.create import EmulatedCreate
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
 from sim.wire.line import Disturbance, LineFault, PseudoSerialPort
+from sim.wire.servo import EmulatedServo, EmulatedServoBus
 
 T = TypeVar("T")
 
@@ -168,10 +168,6 @@ class Emulator:
 
 
 WHEEL_MPS2 = 2.0
-FULL_SPEED = 530
-"""Speed of a servo without load, 59 rpm, in counts of 0.111 rpm."""
-COUNTS_A_SPEED_COUNT = 0.111 * 360 / 60 / 300 * 1023
-"""Position counts per second for each count of speed."""
 STEP_NS = 50_000_000
 
 
@@ -216,7 +212,10 @@ class SimplePlant:
 class _Shaft:
     def __init__(self, servo: EmulatedServo) -> None:
         self._servo = servo
-        self.count = float(servo.get(36))
+        self._full_speed = servo.FULL_RPM / servo.SPEED_RPM
+        self._counts_a_speed = servo.SPEED_RPM / 60 * servo.TURN_COUNTS
+        """Position counts per second for each count of speed."""
+        self.count = float(servo.shaft)
 
     def turn(self, dt_s: float, blocked: bool, now_ns: int) -> None:
         motor = self._servo.motor
@@ -226,8 +225,8 @@ class _Shaft:
             share = min(max(abs(error) / motor.slope, motor.punch), 1.0)
             load = copysign(motor.limit * share if blocked else 0.05 * motor.limit, error)
             if not blocked and dt_s > 0.0:
-                fastest = motor.speed or FULL_SPEED
-                step = min(abs(error), min(fastest, FULL_SPEED) * COUNTS_A_SPEED_COUNT * dt_s)
-                speed = copysign(step / COUNTS_A_SPEED_COUNT / dt_s, error)
+                fastest = min(motor.speed or self._full_speed, self._full_speed)
+                step = min(abs(error), fastest * self._counts_a_speed * dt_s)
+                speed = copysign(step / self._counts_a_speed / dt_s, error)
                 self.count += copysign(step, error)
         self._servo.sense(round(self.count), round(speed), load, now_ns)

@@ -21,8 +21,9 @@ import msgspec
 
 from sim.wire.control import Control, ControlServer
 from sim.wire.create import EmulatedCreate
-from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus, Motor
 from sim.wire.emulator import Device, Emulator
+from sim.wire.models import servo_of
+from sim.wire.servo import EmulatedServoBus, Motor
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -45,7 +46,7 @@ class Setup(msgspec.Struct, array_like=True):
 
 
 class MotorOrder(msgspec.Struct, array_like=True):
-    """`sim.wire.dynamixel.Motor` as a message."""
+    """`sim.wire.servo.Motor` as a message."""
 
     on: bool
     goal: int
@@ -73,7 +74,7 @@ class PlantState(msgspec.Struct, array_like=True):
     bump_left: bool
     bump_right: bool
     shafts: dict[int, tuple[int, int, float]]
-    """By servo ID: position (counts), speed (0.111 rpm) and load (share of stall torque)."""
+    """By servo ID: place (counts), speed (the servo's unit) and load (share of stall torque)."""
 
 
 class Channel:
@@ -164,10 +165,9 @@ def firmware(setup: Setup) -> tuple[EmulatedCreate, dict[str, EmulatedServoBus]]
     for name, rows in setup.lines.items():
         servos = []
         for row in rows:
-            servo = EmulatedServo(row.number, row.model, row.overload_s)
-            servo.put(36, row.position)
-            servo.put(30, row.position)
-            servo.put(24, 1)
+            servo = servo_of(row.model, row.number, row.overload_s)
+            servo.stand(row.position)
+            servo.put(servo.AT.torque, 1)
             servos.append(servo)
         lines[name] = EmulatedServoBus(servos)
     return EmulatedCreate(setup.wheel_base_mm), lines

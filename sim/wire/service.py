@@ -21,14 +21,17 @@ from sim.base import MobileBase
 from sim.camera import SimKinect
 from sim.realism import BodyRealism
 from sim.service import SimConfig, Simulator, keep_going, make_kinect, make_world
-from sim.servos import LOAD_COUNTS, SPEED_COUNT_RADPS, Drive, SimServo, SimServoNetwork
-from sim.wire.dynamixel import Motor
+from sim.servos import Drive, SimServo, SimServoNetwork
 from sim.wire.firmware import Channel, MotorOrders, PlantState, ServoSetup, Setup
+from sim.wire.models import model_of
+from sim.wire.servo import Motor
 from sim.world import NETWORKS, Motors, World
 
 LIMP_SHARE = 0.05
 """Friction of a limp servo's gears, as a share of its stall torque."""
 LIMP_RADPS = 1.0
+FULL_RADPS = 12.0
+"""Speed of a servo whose speed register is 0: the joint's own limit is below."""
 
 
 class WireServo(SimServo):
@@ -45,15 +48,16 @@ class WireServo(SimServo):
             return Drive(self.angle_rad, LIMP_RADPS, LIMP_SHARE * joint.torque_nm)
         error_counts = motor.goal - self.count
         share = min(max(abs(error_counts) / motor.slope, motor.punch), 1.0)
-        speed_radps = min((motor.speed or LOAD_COUNTS) * SPEED_COUNT_RADPS * speed_factor, joint.max_speed_radps)
+        asked_radps = motor.speed * joint.units.speed_radps or FULL_RADPS
+        speed_radps = min(asked_radps * speed_factor, joint.max_speed_radps)
         error_rad = joint.to_angle(motor.goal) - self._play.shaft_rad
         return Drive(self.angle_rad + error_rad, speed_radps, joint.torque_nm * motor.limit * share)
 
     @property
     def measurements(self) -> tuple[int, int, float]:
-        """Position (counts), speed (0.111 rpm) and load (share of stall torque), in the servo's sense of rotation."""
+        """Position (counts), speed (the servo's unit) and load (share of stall torque), as the servo turns."""
         sign = self.joint.direction
-        return self.count, round(sign * self.speed_radps / SPEED_COUNT_RADPS), sign * self.load
+        return self.count, round(sign * self.speed_radps / self.joint.units.speed_radps), sign * self.load
 
 
 class WireNetwork(SimServoNetwork):
@@ -101,7 +105,6 @@ class WireMotors:
         return Motors(self.base, networks)
 
 
-MODELS = {"arm": 28, "hand": 12}
 START_S, END_S = 30.0, 3.0
 
 
@@ -149,10 +152,10 @@ class WireSimulator(Simulator):
 def setup_of(robot: Robot, motors: WireMotors, seed: int) -> Setup:
     lines = {
         name: [
-            ServoSetup(joint.id, MODELS[name], joint.overload_s, motors.servos[joint.id].count)
+            ServoSetup(joint.id, model_of(name, network.protocol), joint.overload_s, motors.servos[joint.id].count)
             for joint in (robot.joints[row] for row in robot.network_joints(name))
         ]
-        for name in MODELS
+        for name, network in robot.networks.items()
     }
     return Setup(robot.base.wheel_separation_m * 1000.0, lines, seed)
 
