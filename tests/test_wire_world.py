@@ -67,6 +67,25 @@ def test_a_servo_goes_to_the_goal_in_its_register_at_the_speed_in_its_register(
     assert elbow.count == pytest.approx(start + 200, abs=3)
 
 
+def test_feetech_servos_move_the_same_arm_in_their_own_units(motors: WireMotors) -> None:
+    robot = ROBOT.with_networks(protocol="feetech")
+    with World(robot, scene(), motors=motors.make) as world:
+        elbow = motors.servos[ELBOW]
+        start = elbow.count
+        _, lines = firmware(setup_of(robot, motors, seed=3))
+        servo = lines["arm"].by_number(ELBOW)
+        assert (servo.get(3), servo.get(56), servo.get(42)) == (777, start, start)
+        servo.put(42, start + 800)
+        servo.put(46, 326)  # 0.5 rad/s
+        elbow.motor = servo.motor
+        run(world, 0.5)
+        unit_rad = UNITS["feetech"].count_rad
+        assert (elbow.count - start) * unit_rad == pytest.approx(0.5 * 0.5, abs=0.05)
+        assert elbow.measurements[1] == pytest.approx(326, abs=40)
+        run(world, 3.0)
+        assert (start + 800 - elbow.count) * unit_rad == pytest.approx(0.0, abs=0.03)  # it sags under its load
+
+
 def test_a_limp_arm_sinks_and_one_without_torque_limit_does_too(world: World, motors: WireMotors) -> None:
     shoulder = motors.servos[ROBOT.joints["shoulder"].id]
     for joint, angle_rad in {"shoulder": 0.8, "elbow": 0.0, "wrist_pitch": 0.0}.items():

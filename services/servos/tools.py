@@ -20,8 +20,8 @@ from cocoro.servo_units import Protocol
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.families import FAMILIES
 
-BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600, 250_000, 128_000, 76_800, 38_400)
-"""Baud rates, most common first."""
+BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600, 38_400, 250_000, 128_000, 76_800)
+"""Baud rates, most common first, and last what some adapters do not have."""
 SCAN_S = 0.02
 READINGS = 20
 MARGIN_DEG = 2.0
