@@ -13,14 +13,17 @@ from cocoro.clock import NS
 from cocoro.description import Joint
 from cocoro.messages import ServoCommand
 from cocoro.robot import Robot
-from cocoro.servo_units import UNITS
+from cocoro.servo_units import UNITS, Protocol
 from services.servos.dynamixel import DYNAMIXEL
-from services.servos.family import ServoReading
+from services.servos.families import FAMILIES
+from services.servos.family import ServoFamily, ServoReading
+from services.servos.feetech import FEETECH
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
 from services.servos.network import MISSES, ServoNetwork, ServoStatus, ServoTask
 
 ROBOT = Robot.load()
 MS = 1_000_000
+families = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 ELBOW, SHOULDER, WRIST = (ROBOT.joints[name] for name in ("elbow", "shoulder", "wrist_pitch"))
 COUNT = UNITS["dynamixel"].count_rad
 
@@ -49,14 +52,15 @@ class Led:
                 self.goals.append(self.motion.joint.to_angle(order[0]))
                 self.speeds.append(order[1])
             self.now_ns += 20 * MS
-            step = self.speeds[-1] * DYNAMIXEL.units.speed_radps / 50
+            step = self.speeds[-1] * self.motion.joint.units.speed_radps / 50
             left = self.goals[-1] - self.position_rad
             self.position_rad += min(max(left, -step), step)
             self.position_rad = min(self.position_rad, self.blocked_at_rad)
 
 
-def test_a_joint_goes_to_its_goal_at_the_speed_that_was_commanded() -> None:
-    led = Led()
+@pytest.mark.parametrize("protocol", UNITS)
+def test_a_joint_goes_to_its_goal_at_the_speed_that_was_commanded(protocol: Protocol) -> None:
+    led = Led(ROBOT.with_networks(protocol=protocol).joints["elbow"])
     led.command(1.0, 0.5, for_ms=10_000)
     led.run(1.0)
     assert led.position_rad == pytest.approx(0.5, abs=0.02)
@@ -144,9 +148,10 @@ def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, vol
 class Net:
     """A network of servos that answer; times are in ms."""
 
-    def __init__(self, name: str = "arm") -> None:
-        joints = [ROBOT.joints[joint] for joint in ROBOT.network_joints(name)]
-        self.net = ServoNetwork(joints, DYNAMIXEL, keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
+    def __init__(self, name: str = "arm", protocol: Protocol = "dynamixel") -> None:
+        robot = ROBOT.with_networks(protocol=protocol)
+        joints = [robot.joints[joint] for joint in robot.network_joints(name)]
+        self.net = ServoNetwork(joints, FAMILIES[protocol], keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
         self.net.port_fault = ""
         self.now_ns = NS
         self.tasks: list[ServoTask] = []
@@ -327,12 +332,13 @@ def test_a_limp_joint_stays_limp_until_it_is_told_to_hold(arm: Net) -> None:
     assert arm.net.orders(arm.now_ns)[5][0] == 512
 
 
-def test_heat_and_voltage_are_told() -> None:
-    arm = Net()
-    arm.net.read(5, reading(temperature_c=66, voltage_v=8.2), arm.now_ns)
+@pytest.mark.parametrize(("protocol", "bad_v"), [("dynamixel", 8.2), ("feetech", 15.0)])
+def test_heat_and_voltage_are_told(protocol: Protocol, bad_v: float) -> None:
+    arm = Net(protocol=protocol)
+    arm.net.read(5, reading(temperature_c=66, voltage_v=bad_v), arm.now_ns)
     faults = arm.faults()
     assert "elbow is hot: 66 C" in faults
-    assert "elbow has a bad voltage: 8.2 V" in faults
+    assert f"elbow has a bad voltage: {bad_v} V" in faults
 
 
 def test_without_its_port_a_network_is_silent_and_says_why(arm: Net) -> None:
@@ -369,12 +375,27 @@ def test_measured_joint_limits_are_what_the_servo_line_keeps(tmp_path: Path) -> 
     assert max(order[0] for order in orders if order is not None) == joint.to_count(radians(10.0))
 
 
-def test_direction_and_centre_of_a_joint_are_its_own() -> None:
-    joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0)
-    net = ServoNetwork([joint], DYNAMIXEL, keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
+@families
+def test_direction_and_centre_of_a_joint_are_its_own_and_units_its_familys(family: ServoFamily) -> None:
+    units = family.units
+    joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0, units=units)
+    net = ServoNetwork([joint], family, keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
     net.read(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None
-    assert state.position_rad[0] == pytest.approx(100 * COUNT)
-    assert state.speed_radps[0] < 0
-    assert state.load[0] < 0
+    assert state.position_rad[0] == pytest.approx(100 * units.count_rad)
+    assert state.speed_radps[0] == pytest.approx(-10 * units.speed_radps)
+    assert state.load[0] == pytest.approx(-100 / units.full_torque)
+
+
+@pytest.mark.parametrize("error", [0x02, 0x04, 0x08, 0x20])
+def test_each_word_of_a_feetech_that_it_does_not_hold_is_a_fault_and_its_voltage_is_none(error: int) -> None:
+    arm = Net(protocol="feetech")
+    arm.net.set_latch("released")
+    arm.cycle()
+    arm.cycle()
+    arm.cycle(1000, elbow=0x01)
+    assert arm.net.latched_faults() == ()
+    arm.cycle(elbow=error | 0x01)
+    assert arm.net.latched_faults() == (f"elbow: {FEETECH.errors[error]}",)
+    assert 5 not in arm.net.orders(arm.now_ns)

@@ -25,8 +25,8 @@ def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
         if checked[0].state == "ok":
             joints = [robot.joints[joint] for joint in robot.network_joints(name)]
             row = robot.networks[name]
-            with_port = name, port_path(port, robot_name)
-            checks += _servos(*with_port, row.baud, FAMILIES[row.protocol], joints, config.reply_s)
+            path, family = port_path(port, robot_name), FAMILIES[row.protocol]
+            checks += _servos(name, path, row.baud, family, joints, config.reply_s)
     return checks
 
 
