@@ -24,7 +24,6 @@ from services.base.service import BaseConfig
 from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.doctor import check as check_servos
-from services.servos.dynamixel import DYNAMIXEL
 from services.servos.feetech import FEETECH
 from services.servos.service import ServosConfig
 from sim.wire.create import EmulatedCreate
@@ -80,14 +79,18 @@ def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: 
 
 
 def test_a_scan_tells_the_families_on_one_line_from_each_other(tmp_path: Path) -> None:
-    bus = EmulatedServoBus([EmulatedDynamixel(1), EmulatedFeetech(2), EmulatedDynamixel(3, 28)])
-    bus.servos[0].put(0, 999)  # a model that nobody knows
+    bus = EmulatedServoBus([EmulatedDynamixel(1), EmulatedFeetech(2), EmulatedDynamixel(3, 28), EmulatedFeetech(4)])
+    bus.servos[0].put(0, 999)  # models that nobody knows
+    bus.servos[3].put(3, 999)
     with Emulator(tmp_path, {"line": bus}, SimplePlant(None, bus)), ServoBus(str(tmp_path / "line"), 1_000_000) as line:
-        line.family = FEETECH
-        assert [tools.recognise(line, number) for number in (2, 3, 4)] == [True, True, False]
-        line.family = DYNAMIXEL
-        models = [tools.examine(line, 0, number).model for number in (1, 2, 3) if tools.recognise(line, number)]
-        assert models == ["model 999", "STS3215", "RX-28"]
+        found = [tools.examine(line, 0, number) for number in range(1, 7) if tools.recognise(line, number)]
+        assert [(one.model, one.protocol) for one in found] == [
+            ("model 999", "dynamixel"),
+            ("STS3215", "feetech"),
+            ("RX-28", "dynamixel"),
+            ("model 999", "feetech"),
+        ]
+        assert line.family is FEETECH  # nobody answered as 5 and 6
 
 
 @both

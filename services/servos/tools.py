@@ -72,17 +72,20 @@ def scan(
 
 
 def recognise(bus: ServoBus, number: int) -> bool:
-    """Whether a servo answers as `number`. The bus then is of its family, or of the one that it was of when no family
-    knows the servo's model."""
-    at_first = bus.family
-    for bus.family in FAMILIES.values():
-        model = bus.ping(number)
-        if model is None:
-            break
-        if model in bus.family.models:
-            return True
-    bus.family = at_first
-    return model is not None
+    """Whether a servo answers as `number`. The bus then is of its family: of the one that knows its model, or else of
+    the only one in whose register it has this ID. Otherwise the bus's family stays as it was."""
+    at_first, likely = bus.family, []
+    try:
+        for bus.family in FAMILIES.values():
+            if bus.read(number, "model") in bus.family.models:
+                return True
+            if bus.read(number, "id") == number:
+                likely.append(bus.family)
+    except SilentError:
+        bus.family = at_first
+        return False
+    bus.family = likely[0] if len(likely) == 1 else at_first
+    return True
 
 
 def examine(bus: ServoBus, baud: int, number: int) -> FoundServo:
