@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from math import nan
 from pathlib import Path
 from typing import TypeVar
 
@@ -156,7 +157,8 @@ class Moved:
 
 
 def angle(state: ServoState, joint: str) -> float:
-    return state.position_rad[state.joints.index(joint)]
+    """Not a number while its servo is silent, as on a busy machine it is at times."""
+    return state.position_rad[state.joints.index(joint)] if joint in state.joints else nan
 
 
 @asynccontextmanager
