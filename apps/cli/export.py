@@ -66,8 +66,8 @@ def export(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments; or turn captures
-    into a dataset to train with. Several forms at once are possible."""
+    """Turn a capture into a film, tables, a file for Foxglove or Rerun; captures into a LeRobotDataset. Its attachments
+    can be extracted, too. Several forms at once are possible, but a dataset is made alone."""
     if lerobot is not None:
         if any((video, rrd, foxglove, csv, parquet, attachments)):
             raise ConfigError("--lerobot is a form of many captures; make the other forms by another command")
