@@ -68,12 +68,12 @@ class BaseDriver:
         `Base.patience_s` after the command's stamp, the sooner the faster."""
         if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
             return
-        if command.aside_mps:
+        try:
+            wheels_mps = wheels_of(self._base, command)
+        except ValueError:  # what it cannot do
             return
         limit_mmps = self._base.max_wheel_speed_mps * 1000.0
-        left, right = (
-            round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps)) for speed_mps in wheels_of(self._base, command)
-        )
+        left, right = (round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps)) for speed_mps in wheels_mps)
         self._wanted_mmps = left, right
         patience_s = self._base.patience_s(max(abs(left), abs(right)) / 1000.0)
         self._until_ns = min(command.stamp_ns, now_ns) + round(patience_s * NS)
