@@ -2,8 +2,9 @@
 
 `python -m bench.network_speaker router|client ENDPOINT LEASE_S LIFE_S`. The router listens and puts a message with a
 number on `tick`, at most fifty times a second. The client subscribes to it and prints the time of the steady clock and
-the number; for each line of its standard input it asks the router's `echo` and prints the reply. Both have the
-project's options of a session, print `ready` first, and end after LIFE_S.
+the number; for each line of its standard input it asks the router's `echo`, again until a reply comes, and prints that:
+a session that has just begun may not know yet who answers. Both have the project's options of a session, print `ready`
+first, and end after LIFE_S.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 from itertools import count
 from typing import Any
@@ -23,7 +25,16 @@ from sim.network.network import Host
 
 PERIOD_S = 0.02
 PATIENCE_S = 60.0
+ANSWER_S = 5.0
+"""Longest wait for one answer, with the retries of a cut and lossy link."""
+_SAYING = threading.Lock()
 IDENTITIES = {"router": "a1", "client": "b2"}
+
+
+def say(*words: object) -> None:
+    """Prints a line whole: messages are printed by a thread of zenoh, and `print` writes word by word."""
+    with _SAYING:
+        print(*words, flush=True)
 
 
 def opened(mode: str, endpoint: str, lease_s: float) -> zenoh.Session:
@@ -37,18 +48,20 @@ def opened(mode: str, endpoint: str, lease_s: float) -> zenoh.Session:
 
 def route(session: zenoh.Session) -> None:
     session.declare_queryable("echo", lambda query: query.reply("echo", str(query.parameters)))
-    print("ready", flush=True)
+    say("ready")
     for number in count():
         session.put("tick", str(number))
         time.sleep(PERIOD_S)
 
 
 def listen(session: zenoh.Session) -> None:
-    session.declare_subscriber("tick", lambda tick: print(time.monotonic(), tick.payload.to_string(), flush=True))
-    print("ready", flush=True)
+    session.declare_subscriber("tick", lambda tick: say(time.monotonic(), tick.payload.to_string()))
+    say("ready")
     for line in sys.stdin:
-        for reply in session.get(f"echo?{line.strip()}", timeout=PATIENCE_S):
-            print("reply", reply.ok.payload.to_string() if reply.ok else "", flush=True)
+        while not (replies := list(session.get(f"echo?{line.strip()}", timeout=ANSWER_S))):
+            time.sleep(PERIOD_S)
+        for reply in replies:
+            say("reply", reply.ok.payload.to_string() if reply.ok else "")
 
 
 class Speaker:

@@ -339,9 +339,11 @@ async def test_no_one_logs_in_where_nothing_is_encrypted(short_path: Path) -> No
 
 @in_real_time
 async def test_half_done_handshakes_are_few_and_end(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.cockpit.access_door.HANDSHAKE_S", 0.3)
-    async with served(**remote(lab)) as cockpit, silent(cockpit, 30):
-        await until(lambda: cockpit.audit.has("too many handshakes"))
-        await until(lambda: not cockpit.taken())
+    async with served(**remote(lab)) as cockpit:
+        with monkeypatch.context() as patch:  # not for the person below, whose handshake may be slow
+            patch.setattr("services.cockpit.access_door.HANDSHAKE_S", 0.3)
+            async with silent(cockpit, 30):
+                await until(lambda: cockpit.audit.has("too many handshakes"))
+                await until(lambda: not cockpit.taken())
         assert cockpit.audit.has("TLS handshake failed")
         assert (await get(cockpit, lab.client("ada")))[9:12] == b"200"
