@@ -144,7 +144,7 @@ def _try_all(scene: Scene, who: str) -> list[str]:
 
 
 def _ask_until_seen(scene: Scene, intruder: Intruder, mark: str) -> None:
-    """Asks what everyone may ask until the brain's host hears it: the mesh learns a moment later that somebody answers."""
+    """Asks what everyone may ask until the brain hears it: the mesh learns a moment later that somebody answers."""
 
     def seen() -> bool:
         intruder("ask", key=REPORT.key(ROBOT), payload=mark)
