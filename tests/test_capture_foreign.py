@@ -78,6 +78,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("package.json", "package-lock.json", "read.mjs", "foxglove.mjs"):
         shutil.copy(HERE / "foreign" / name, folder)
     command = ["npm", "ci", "--no-audit", "--no-fund", "--prefer-offline", "--ignore-scripts"]
+    command += ["--fetch-retries=0", "--fetch-timeout=20000"]  # by itself it tries for more than a minute
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
     if done.returncode:
         if any(word in done.stderr for word in UNREACHABLE):
