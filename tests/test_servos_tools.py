@@ -22,7 +22,7 @@ from deploy.processes import named
 from services.base.doctor import check as check_base
 from services.base.service import BaseConfig
 from services.servos import tools
-from services.servos.bus import ServoBus
+from services.servos.bus import ServoBus, SilentError
 from services.servos.doctor import check as check_servos
 from services.servos.feetech import FEETECH
 from services.servos.service import ServosConfig
@@ -30,9 +30,11 @@ from sim.wire.create import EmulatedCreate
 from sim.wire.dynamixel import EmulatedDynamixel
 from sim.wire.emulator import Emulator, SimplePlant
 from sim.wire.feetech import EmulatedFeetech
+from sim.wire.line import LineFault
 from sim.wire.servo import EmulatedServoBus
 
 ROBOT = Robot.load()
+FOREVER_NS = 10**19
 
 
 pytestmark = pytest.mark.zenoh  # each answer of the emulated wire must come within some real time
@@ -53,7 +55,7 @@ def bench(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[ServoBench
 
 @pytest.fixture
 def line(bench: ServoBench) -> Iterator[ServoBus]:
-    with bench.bus() as line:
+    with bench.bus(tries=tools.TRIES) as line:
         yield line
 
 
@@ -131,6 +133,17 @@ def test_zero_and_direction_come_from_two_turns_by_hand(
     values = tools.calibrate(line, elbow, 30.0, by_hand(bench, 600, turned))
     there = direction * 30.0 / degrees(elbow.units.count_rad)
     assert values["centre_count"] == pytest.approx(centre - there, abs=0.01)
+
+
+@both
+def test_a_lost_packet_ends_no_calibration(bench: ServoBench) -> None:
+    wire = bench.emulator.lines["arm"]
+    bench.call(lambda: wire.disturb(LineFault("truncated", 0.05, "to_driver", FOREVER_NS)))
+    elbow = bench.robot.joints["elbow"]
+    with bench.bus(tries=tools.TRIES) as line:
+        assert tools.calibrate(line, elbow, 0.0, by_hand(bench, 600, 700))["direction"] == 1
+    with bench.bus(reply_s=0.02) as once, pytest.raises(SilentError):
+        _ = [once.reading(elbow.id) for _ in range(200)]
 
 
 @both

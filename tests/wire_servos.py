@@ -63,9 +63,9 @@ class ServoBench:
     def servo(self, number: int) -> EmulatedServo:
         return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
 
-    def bus(self, name: str = "arm", reply_s: float = REPLY_S, baud: int = 1_000_000) -> ServoBus:
+    def bus(self, name: str = "arm", reply_s: float = REPLY_S, baud: int = 1_000_000, tries: int = 1) -> ServoBus:
         """A driver of a line."""
-        return ServoBus(self.port(name), baud, reply_s, self.family)
+        return ServoBus(self.port(name), baud, reply_s, self.family, tries)
 
     def put(self, number: int, **registers: int) -> None:
         """Set registers of a servo between two packets."""

@@ -191,7 +191,8 @@ class ServoWorkbench:
     def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
         """Opens the serial line that the joint's servo is on."""
         row = self.robot.networks[joint.network]
-        with ServoBus(port or self.ports[joint.network], baud or row.baud, REPLY_S, FAMILIES[row.protocol]) as line:
+        where, family = port or self.ports[joint.network], FAMILIES[row.protocol]
+        with ServoBus(where, baud or row.baud, REPLY_S, family, tools.TRIES) as line:
             yield line
 
     def write(self, joint: Joint, values: dict[str, Any]) -> None:
@@ -296,7 +297,7 @@ def set_id(
     json: JsonOption = False,
 ) -> None:
     """Give a servo another ID, and set its return delay to 0. Best with no other servo on the line."""
-    with ServoBus(port, baud, REPLY_S) as line:
+    with ServoBus(port, baud, REPLY_S, tries=tools.TRIES) as line:
         tools.set_number(line, old, new)
     data = {"port": port, "id": new, "return_delay_us": 0}
     tell(json, data, f"the servo on {port} has ID {new} and return delay 0")

@@ -15,9 +15,9 @@ import errno
 import select
 import termios
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import serial
 from dynamixel_sdk.port_handler import PortHandler
@@ -160,6 +160,9 @@ SENTENCES = {
 }
 
 
+Answer = TypeVar("Answer")
+
+
 class SilentError(CocoroError):
     """A servo does not answer."""
 
@@ -179,8 +182,13 @@ class PortError(CocoroError):
 class ServoBus:
     """A context manager. Every method raises PortError when the line fails; the bus is unusable afterwards."""
 
-    def __init__(self, path: str, baud: int, timeout_s: float = REPLY_S, family: ServoFamily = DYNAMIXEL) -> None:
+    def __init__(
+        self, path: str, baud: int, timeout_s: float = REPLY_S, family: ServoFamily = DYNAMIXEL, tries: int = 1
+    ) -> None:
+        """`tries`: how often a servo that does not answer is asked. A service asks once, since its next period comes
+        soon; a tool asks again, since one lost packet shall not end what a person has begun."""
         self.path = path
+        self._tries = tries
         self._sdk = Protocol1PacketHandler()
         self._port = CheckedPort(path, baud, timeout_s)
         self.family = family
@@ -231,6 +239,9 @@ class ServoBus:
 
     def read_block(self, number: int, address: int, length: int) -> tuple[bytes, int]:
         """Read the bytes of consecutive registers, and the error byte. Raises SilentError."""
+        return self._answered(lambda: self._block(number, address, length))
+
+    def _block(self, number: int, address: int, length: int) -> tuple[bytes, int]:
         try:
             data, result, error = self._sdk.readTxRx(self._port, number, address, length)
         except (OSError, ValueError) as fault:
@@ -241,7 +252,10 @@ class ServoBus:
 
     def reading(self, number: int) -> ServoReading:
         """Read what the servo measures now. Raises SilentError."""
-        data, error = self.read_block(number, self.family.registers["present_position"].address, READING_LENGTH)
+        return self._answered(lambda: self._reading(number))
+
+    def _reading(self, number: int) -> ServoReading:
+        data, error = self._block(number, self.family.registers["present_position"].address, READING_LENGTH)
         found = self.family.reading(data, error, time.monotonic_ns()) if len(data) == READING_LENGTH else None
         if found is None:
             raise SilentError(number)
@@ -254,6 +268,10 @@ class ServoBus:
         row = self.family.registers[register]
         if not row.writable:
             raise ValueError(f"register {register} is read-only")
+        return self._answered(lambda: self._write(number, register, value))
+
+    def _write(self, number: int, register: str, value: int) -> int:
+        row = self.family.registers[register]
         try:
             result, error = self._sdk.writeTxRx(
                 self._port, number, row.address, row.size, list(value.to_bytes(row.size, "little"))
@@ -301,6 +319,12 @@ class ServoBus:
             self._sdk.syncWriteTxOnly(self._port, address, length, data, len(data))
         except OSError as fault:
             raise PortError(f"{self.path}: {_sentence(fault)}") from fault
+
+    def _answered(self, ask: Callable[[], Answer]) -> Answer:
+        for _ in range(self._tries - 1):
+            with suppress(SilentError):
+                return ask()
+        return ask()
 
     def _refusals_in(self, error: int) -> str:
         return ", ".join(self.family.errors_in(error & self.family.refusals))

@@ -32,7 +32,7 @@ def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
 
 def _servos(name: str, path: str, baud: int, family: ServoFamily, joints: list[Joint], reply_s: float) -> list[Check]:
     try:
-        with ServoBus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
+        with ServoBus(path, baud, max(reply_s, tools.SCAN_S), tries=tools.TRIES) as bus:
             return [_servo(bus, baud, family, joint) for joint in joints]
     except PortError as error:
         return [note(f"{name} servos", f"{error}: does their service run? See `cocoro status`")]

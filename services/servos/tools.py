@@ -24,6 +24,8 @@ BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600, 38_400, 250_000,
 """Baud rates, most common first, and last what some adapters do not have."""
 SCAN_S = 0.02
 READINGS = 20
+TRIES = 3
+"""So often a tool asks a servo that does not answer. A scan asks once: most of the IDs that it asks are not there."""
 MARGIN_DEG = 2.0
 """Margin between the measured ends of a joint and its limits."""
 TURNED_RAD = radians(5.8)
