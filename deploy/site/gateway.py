@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime
@@ -34,6 +35,7 @@ from deploy.site.plan import Site
 from deploy.site.refusals import Refusal, Watch
 from deploy.site.rights import of_clocks
 from deploy.site.rules import compiled
+from deploy.site.throttle import ALLOWED_BYTES_S, PERIOD_S, Throttle
 from deploy.site.timekeeping import Timekeeping, tell_time
 
 LOOK_S = 1.0
@@ -44,6 +46,7 @@ SHOWN = 3
 """Refusals in health, the most frequent ones."""
 KINDS = 1000
 """Different refusals of one sender that are counted apart. Who tries more than that hides his own alone."""
+TOO_MUCH = f"more than {ALLOWED_BYTES_S / 1e6:g} MB a second, which are held back"
 MEASURED = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
 """What is fused by its time stamps."""
 MEASURES_MS, ELSE_MS = 5.0, 40.0
@@ -82,6 +85,7 @@ class Gateway:
         """How many different refusals of each sender there were."""
         self._untold: Counter[Refusal] = Counter()
         self._loop = asyncio.get_running_loop()
+        self._throttle = Throttle(self._on_busy)
         self._timekeeping = Timekeeping(
             node,
             config.host,
@@ -96,7 +100,9 @@ class Gateway:
         async with AsyncExitStack() as stack:
             watch = Watch(self._on_refusals, lambda line: log.warning("%s", line))
             stack.callback(watch.close)
+            stack.callback(self._throttle.close)
             self._node.spawn(self._tell())
+            self._node.spawn(self._hold_back())
             while True:
                 marks, refused = self._marks(), self._timekeeping.refused
                 site, options, self._admitted = self._read()
@@ -187,6 +193,7 @@ class Gateway:
             self._links[link.zid] = link
         else:
             self._links.pop(link.zid, None)
+        self._throttle.follow(one for one in self._links.values() if one.who.rpartition(".")[0] not in self._hosts)
         log.info("%s %s at %s", "linked with" if there else "lost the link with", link.who or "somebody", link.address)
         odd = self._odd_links()
         for fault in odd:
@@ -232,6 +239,14 @@ class Gateway:
                 for one, count in self._refused.most_common(SHOWN)
             ),
         )
+
+    def _on_busy(self, link: Link) -> None:
+        self._count(Counter({Refusal(link.who, TOO_MUCH): 1}))
+
+    async def _hold_back(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            self._throttle.look(time.monotonic())
 
     def _odd_links(self) -> list[str]:
         """Faults of who is linked. What somebody tries who is not admitted is refused, and zenoh does not tell of it; a
