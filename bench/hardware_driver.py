@@ -100,7 +100,7 @@ async def main(create: str, arm: str, hand: str) -> None:
         threading.Thread(target=listen, daemon=True).start()
         async with asyncio.TaskGroup() as group:
             group.create_task(run_base(base, BaseConfig(port=create)))
-            group.create_task(run_servos(servos, ServosConfig(arm_port=arm, hand_port=hand, reply_s=REPLY_S)))
+            group.create_task(run_servos(servos, ServosConfig(ports={"arm": arm, "hand": hand}, reply_s=REPLY_S)))
             group.create_task(driver.drive())
             group.create_task(driver.tell())
 

@@ -28,7 +28,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from services.base.service import BaseConfig
 from services.base.service import run as run_base
-from services.servos.service import NetworkService, ServosConfig
+from services.servos.service import LineService, ServosConfig
 
 REPLY_S = 0.1
 
@@ -64,9 +64,9 @@ class Meter:
 async def measure_arm(folder: Path, seconds: float, report: Report) -> None:
     """Six servos on one line, each commanded and reported at 50 Hz."""
     robot, mesh, clock = Robot.load(), LocalMesh(), RealClock()
-    joints = robot.network_joints("arm")
+    joints = robot.group_joints("arm")
     async with Node("arm", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
-        service = NetworkService(node, ServosConfig(arm_port=str(folder / "arm"), reply_s=REPLY_S))
+        service = LineService("arm", {"arm": node}, ServosConfig(port=str(folder / "{line}"), reply_s=REPLY_S))
         work = asyncio.ensure_future(service.run())
         other.publish(topics.LATCH, Latch(state="released"))
         goal_rad = 0.3

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.errors import ConfigError
-from cocoro.servo_units import UNITS, Protocol, ServoUnits
+from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
 from cocoro.units import Positive, Vec3
 
 OWN_FILE = "calliope.toml"
@@ -111,17 +111,6 @@ class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position_m: Vec3
 
 
-class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One bus of servos."""
-
-    baud: int
-    rate_hz: Positive
-    command_timeout_s: Positive
-    """A command to these joints is valid for this time."""
-    protocol: Protocol = "dynamixel"
-    """What its servos speak."""
-
-
 class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pad_length_m: Positive
     """Length of a finger and of the pad along it."""
@@ -200,52 +189,6 @@ class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `mount` is the mount."""
 
 
-class JointRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    network: Literal["arm", "hand"]
-    id: int
-    limits_deg: tuple[float, float]
-    torque_nm: Positive
-    max_speed_radps: Positive
-    compliance_deg: Annotated[float, Meta(ge=0)] = 0.0
-    """Distance from the goal beyond which the servo pushes with all of `torque_nm`; 0: always."""
-    overload_s: Positive = 5.0
-    """A servo that pushes at its limit for this long is overloaded."""
-    direction: Literal[-1, 1] = 1
-    centre_count: float | None = None
-    """The servo's position at the joint's angle 0; by default the middle of the servo's range."""
-
-    def __post_init__(self) -> None:
-        if not self.limits_deg[0] < self.limits_deg[1]:
-            raise ValueError(f"joint {self.name}: limits_deg must rise, not {self.limits_deg}")
-
-    @property
-    def limits_rad(self) -> tuple[float, float]:
-        return radians(self.limits_deg[0]), radians(self.limits_deg[1])
-
-
-class Joint(JointRow, frozen=True):
-    """A row of the description with what follows from its network's protocol."""
-
-    centre_count: float = UNITS["dynamixel"].centre_count
-    units: ServoUnits = UNITS["dynamixel"]
-
-    @classmethod
-    def of(cls, row: JointRow, protocol: Protocol) -> Joint:
-        units = UNITS[protocol]
-        centre_count = units.centre_count if row.centre_count is None else row.centre_count
-        return cls(**{**msgspec.structs.asdict(row), "centre_count": centre_count, "units": units})
-
-    def to_count(self, angle_rad: float) -> int:
-        """The servo position nearest to a joint angle (radians), clipped to the servo's range."""
-        count = round(self.centre_count + self.direction * angle_rad / self.units.count_rad)
-        return min(max(count, 0), self.units.counts - 1)
-
-    def to_angle(self, count: float) -> float:
-        """The joint angle, radians, of a servo position."""
-        return self.direction * (count - self.centre_count) * self.units.count_rad
-
-
 class LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     parent: str
@@ -265,7 +208,7 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     link: list[LinkRow]
     arm: Arm
     marker: Marker
-    network: dict[Literal["arm", "hand"], Network]
+    network: dict[LineName, Network]
     joint: list[JointRow]
     claw: Claw
     hull: Hull
@@ -274,8 +217,8 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Refuses what contradicts itself: names of links and joints that the description does not have, circles of
-        links, limbs whose joints move nothing, poses without a joint that they need, boxes whose corners are
-        swapped."""
+        links, lines with one ID twice, limbs whose joints move nothing or are on several lines, poses without a joint
+        that they need, boxes whose corners are swapped."""
         self._check_links()
         self._check_places()
         self._check_limbs()
@@ -285,6 +228,22 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ):
             if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
                 raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+
+    @property
+    def groups(self) -> dict[str, Group]:
+        """By joint, the group that commands it. A joint that moves neither hand nor camera, such as a wheel's, is in
+        none."""
+        rows = {row.name: row for row in self.link}
+        groups: dict[str, Group] = {}
+        for tip in (self.arm.tip, self.kinect.link):
+            row = rows.get(tip)
+            while row is not None:
+                if row.joint is not None:
+                    groups[row.joint] = "arm"
+                row = rows.get(row.parent)
+        for joint in (self.arm.roll, *self.claw.open_sign):
+            groups[joint] = "hand"
+        return groups
 
     def _check_links(self) -> None:
         parents = {row.name: row.parent for row in self.link}
@@ -316,8 +275,7 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def _check_limbs(self) -> None:
         arm, joints = self.arm, {joint.name for joint in self.joint}
-        if lost := [joint for joint in self.joint if joint.network not in self.network]:
-            raise ValueError(f"joint {lost[0].name}: there is no network {lost[0].network!r}")
+        check_lines(self.joint, self.network)
         limbs = [("claw", set(self.claw.open_sign)), ("head", {self.head.pan, self.head.tilt})]
         limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
@@ -330,6 +288,9 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{where}: the joint {idle[0]!r} moves no link")
         if arm.bend not in arm.joints:
             raise ValueError(f"arm: bend = {arm.bend!r} is none of its joints {', '.join(arm.joints)}")
+        check_groups(self.joint, groups := self.groups)
+        if lost := [joint for joint in arm.joints if groups.get(joint) != "arm"]:
+            raise ValueError(f"arm: the joint {lost[0]!r} is not between the body and the hand")
         for name, wanted in (("park", arm.joints), ("upright", arm.joints), ("unfolded", arm.joints[1:])):
             if missing := [joint for joint in wanted if joint not in self.pose.get(name, {})]:
                 raise ValueError(f"pose {name}: the angle of {missing[0]!r} is missing")

@@ -12,8 +12,9 @@ import msgspec
 import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
-from cocoro.description import Description, Joint, Network, completed, read
+from cocoro.description import Description, completed, read
 from cocoro.errors import ConfigError, field_text
+from cocoro.joints import GROUPS, Group, Joint, Network
 from cocoro.kinematics import Chain, Link, Tree
 
 
@@ -55,12 +56,16 @@ class Robot:
         self.head = spec.head
         self.arm = spec.arm
         self.marker = spec.marker
-        self.networks: dict[str, Network] = {str(name): row for name, row in spec.network.items()}
+        self.networks: dict[str, Network] = spec.network
+        """The serial lines by name."""
         self.claw = spec.claw
         self.hull = spec.hull
         self.poses = spec.pose
         self.solid = spec.solid
-        self.joints = {row.name: Joint.of(row, spec.network[row.network].protocol) for row in spec.joint}
+        groups = spec.groups
+        self.joints = {
+            row.name: Joint.of(row, spec.network[row.network].protocol, groups.get(row.name)) for row in spec.joint
+        }
         self.links = {
             row.name: Link(
                 row.name,
@@ -106,14 +111,27 @@ class Robot:
         return Robot(msgspec.structs.replace(self._spec, base=msgspec.structs.replace(self.base, **changes)))
 
     def with_networks(self, **changes: float | str) -> Robot:
-        """A robot like this one with other values in both of its `[network]` tables."""
+        """A robot like this one with other values in all of its `[network]` tables."""
         networks = {name: msgspec.structs.replace(row, **changes) for name, row in self._spec.network.items()}
         return Robot(msgspec.structs.replace(self._spec, network=networks))
 
     def network_joints(self, network: str) -> tuple[str, ...]:
-        """The joints of one servo network, in the order of their servo IDs."""
+        """The joints on one serial line, those of no group included, in the order of their servo IDs."""
         rows = [joint for joint in self.joints.values() if joint.network == network]
         return tuple(joint.name for joint in sorted(rows, key=lambda joint: joint.id))
+
+    def group_joints(self, group: Group) -> tuple[str, ...]:
+        """The joints that a group's commands and states are about, in the order of their servo IDs."""
+        rows = [joint for joint in self.joints.values() if joint.group == group]
+        return tuple(joint.name for joint in sorted(rows, key=lambda joint: joint.id))
+
+    def line_of(self, group: Group) -> str:
+        """The serial line that all joints of a group are on."""
+        return self.joints[self.group_joints(group)[0]].network
+
+    def groups_on(self, line: str) -> tuple[Group, ...]:
+        """The groups whose joints are on a serial line."""
+        return tuple(group for group in GROUPS if self.line_of(group) == line)
 
     @cached_property
     def jaws(self) -> tuple[str, ...]:

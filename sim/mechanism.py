@@ -59,8 +59,8 @@ class Mechanism:
         infos = [bullet.getJointInfo(self.body, i) for i in range(bullet.getNumJoints(self.body))]
         self.index: dict[str, int] = {CHASSIS: -1} | {info[12].decode(): info[0] for info in infos}
         self.link_names: dict[int, str] = {index: name for name, index in self.index.items()}
-        self.joints = tuple(robot.joints)
-        """Servo joints, in the order of `read()`."""
+        self.joints = tuple(name for name, joint in robot.joints.items() if joint.group is not None)
+        """Servo joints that a group commands, in the order of `read()`."""
         joint_of_link = {link.name: link.joint for link in robot.links.values() if link.joint}
         link_of_joint = {joint: link for link, joint in joint_of_link.items()}
         self._motors = {joint: self.index[link_of_joint[joint]] for joint in self.joints}

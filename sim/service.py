@@ -18,6 +18,7 @@ from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS, Clock
 from cocoro.component import Implementation
+from cocoro.joints import Group
 from cocoro.latch import ServiceLatch
 from cocoro.messages import BaseCommand, BaseState, ClockTick, Frame, LatchState, Message, ServoCommand
 from cocoro.node import Node
@@ -181,8 +182,8 @@ class Simulator:
     def _command_base(self, command: BaseCommand) -> None:
         self._world.command_base(command)
 
-    def _command_servos(self, network: str, command: ServoCommand) -> None:
-        self._world.command_servos(network, command)
+    def _command_servos(self, group: Group, command: ServoCommand) -> None:
+        self._world.command_servos(group, command)
 
     def tick(self) -> None:
         """Advance the clock by one tick: run the physics steps in it, and publish what becomes due."""

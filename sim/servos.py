@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from math import degrees, radians
 from typing import NamedTuple
 
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
 
@@ -160,8 +160,8 @@ class SimServo:
         self.goal_count = self.count
 
 
-class SimServoNetwork:
-    """A network of servos: commands, states, the emergency stop and the expiry of commands.
+class SimServoGroup:
+    """The servos of one group: commands, states, the emergency stop and the expiry of commands.
 
     A joint of arm or neck that is not commanded again within `timeout_s` holds where it is unless it has arrived. With
     `keeps_goal` (the hand) joints keep their goals, also during an emergency stop, so that a held object stays held.
@@ -190,7 +190,7 @@ class SimServoNetwork:
         if self.stopped_by:
             return self.stopped_by
         if unknown := [name for name in command.joints if name not in self.servos]:
-            return f"no joint {unknown[0]!r} on this network, which has {', '.join(self.servos)}"
+            return f"no joint {unknown[0]!r} in this group, which has {', '.join(self.servos)}"
         for name, goal_rad, speed_radps in zip(command.joints, command.goal_rad, command.speed_radps, strict=True):
             self.servos[name].command(goal_rad, speed_radps, now_ns + self._timeout_ns)
         return ""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.joints import GROUPS, KEEPS_GOAL, Group
 from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, ServoState, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
@@ -23,7 +24,7 @@ from sim.realism import REALISM, BodyRealism, Wander, Wear, wheel_scales
 from sim.render.interface import Visual
 from sim.scene import Light, Scene
 from sim.seeds import stream
-from sim.servos import Drive, SimServoNetwork
+from sim.servos import Drive, SimServoGroup
 from sim.stage import Stage
 
 SOLVER_ITERATIONS = 50
@@ -32,7 +33,6 @@ SENSE_HZ = 60.0
 """How often contacts are read and new errors of the body are drawn."""
 CONTACT_MEMORY = 2
 """A contact counts when it was there at one of this many last readings: the solver sometimes drops one for a step."""
-NETWORKS = ("arm", "hand")
 
 
 class WheelMotion(NamedTuple):
@@ -48,22 +48,22 @@ class Motors(NamedTuple):
     """Drives and sensors of wheels and joints."""
 
     base: MobileBase
-    networks: dict[str, SimServoNetwork]
+    groups: dict[Group, SimServoGroup]
 
 
 def message_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
     """Motors that take commands as messages, as the hardware services do."""
-    networks = {
-        name: SimServoNetwork(
-            {joint: robot.joints[joint] for joint in robot.network_joints(name)},
+    groups = {
+        group: SimServoGroup(
+            {joint: robot.joints[joint] for joint in robot.group_joints(group)},
             angles_rad,
-            keeps_goal=name == "hand",
-            timeout_s=robot.networks[name].command_timeout_s,
+            keeps_goal=group in KEEPS_GOAL,
+            timeout_s=robot.networks[robot.line_of(group)].command_timeout_s,
             backlash_deg=realism.backlash_deg,
         )
-        for name in NETWORKS
+        for group in GROUPS
     }
-    return Motors(MobileBase(robot.base, exact=realism.exact_odometry), networks)
+    return Motors(MobileBase(robot.base, exact=realism.exact_odometry), groups)
 
 
 class World:
@@ -108,8 +108,8 @@ class World:
         self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
         self._names = {body: name for name, body in self._stage.bodies.items()}
 
-        self._base, self._networks = motors(robot, angles, realism)
-        servos = {joint: servo for network in self._networks.values() for joint, servo in network.servos.items()}
+        self._base, self._groups = motors(robot, angles, realism)
+        servos = {joint: servo for group in self._groups.values() for joint, servo in group.servos.items()}
         self._servos = [servos[joint] for joint in self._mechanism.joints]
         self._driven: list[Drive | None] = [None] * len(self._servos)
 
@@ -156,24 +156,24 @@ class World:
         """Command wheel speeds. Returns '' when they are accepted, otherwise the reason for refusing."""
         return self._base.command(command, self.time_ns)
 
-    def command_servos(self, network: str, command: ServoCommand) -> str:
+    def command_servos(self, group: Group, command: ServoCommand) -> str:
         """Command joints of 'arm' or 'hand', all or none. Returns '' when accepted, otherwise the reason for
         refusing."""
-        return self._networks[network].command(command, self.time_ns)
+        return self._groups[group].command(command, self.time_ns)
 
     def set_latch(self, state: LatchState, service: str | None = None) -> None:
         """Set the latch of one of base, arm and hand, or of all. Thread-safe."""
         if service in (None, "base"):
             self._base.set_latch(state)
-        for name, network in self._networks.items():
+        for name, group in self._groups.items():
             if service in (None, name):
-                network.set_latch(state)
+                group.set_latch(state)
 
     def base_state(self) -> BaseState:
         return self._base.state(self.time_ns)
 
-    def servo_state(self, network: str) -> ServoState:
-        return self._networks[network].state(self.time_ns)
+    def servo_state(self, group: Group) -> ServoState:
+        return self._groups[group].state(self.time_ns)
 
     # --- time -------------------------------------------------------------------------------------
 
@@ -190,8 +190,8 @@ class World:
         radius_m = self.robot.base.wheel_radius_m
         left_mps, right_mps = self._base.wheels(now_ns, dt_s)
         self._mechanism.spin(left_mps * stretch[0] / radius_m, right_mps * stretch[1] / radius_m, dt_s)
-        for network in self._networks.values():
-            network.expire(now_ns)
+        for group in self._groups.values():
+            group.expire(now_ns)
         self._drive_servos()
 
         self._stage.move(self._steps / self._hz, dt_s)

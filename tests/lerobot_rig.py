@@ -14,6 +14,7 @@ from apps.captures.export.lerobot_episodes import Episode, Recording, recorded_t
 from cocoro import topics
 from cocoro.capture.tables import Tables
 from cocoro.clock import NS
+from cocoro.joints import GROUPS
 from cocoro.messages import BaseCommand, BaseState, Outcome, ServoCommand, ServoState, TaskState
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
@@ -53,9 +54,9 @@ async def run(
         node.ready()
     for tick in range(ticks):
         base.publish(topics.BASE_STATE, BaseState(odometry_m=(0.0, 0.0), **{**STILL, "speed_mps": tick / 100}))
-        for node, topic, network in ((arm, topics.ARM_STATE, "arm"), (hand, topics.HAND_STATE, "hand")):
+        for node, topic, group in zip((arm, hand), (topics.ARM_STATE, topics.HAND_STATE), GROUPS, strict=True):
             if node is hand or tick not in numb:
-                joints = ROBOT.network_joints(network)
+                joints = ROBOT.group_joints(group)
                 still = (0.0,) * len(joints)
                 angles = tuple(angle(joint, tick) for joint in joints)
                 node.publish(topic, ServoState(joints=joints, position_rad=angles, speed_radps=still, load=still))

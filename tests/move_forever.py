@@ -18,7 +18,7 @@ async def main(arm: str, hand: str, protocol: str) -> None:
     mesh, clock = LocalMesh(), RealClock()
     robot = Robot.load().with_networks(protocol=protocol)
     async with Node("servos", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
-        other.spawn(run(node, ServosConfig(arm_port=arm, hand_port=hand, reply_s=0.1)))
+        other.spawn(run(node, ServosConfig(ports={"arm": arm, "hand": hand}, reply_s=0.1)))
         async for _ in other.every(50.0):
             other.publish(topics.LATCH, Latch(state="released"))
             other.publish(topics.ARM_COMMAND, ServoCommand(joints=("elbow",), goal_rad=(2.5,), speed_radps=(0.5,)))

@@ -7,6 +7,7 @@ from typing import Any
 from spelled import action, idle
 
 from cocoro import topics
+from cocoro.joints import Group
 from cocoro.messages import (
     BaseCommand,
     BaseState,
@@ -111,8 +112,8 @@ class Planner:
         if topic.name not in self.silent:
             self.under_test.feed(topic, message, incarnation=self.incarnation)
 
-    def _servos(self, network: str) -> ServoState:
-        joints = ROBOT.network_joints(network)
+    def _servos(self, group: Group) -> ServoState:
+        joints = ROBOT.group_joints(group)
         loads = {claw: -sign * self.hand_load for claw, sign in ROBOT.claw.open_sign.items()}
         return ServoState(
             joints=joints,

@@ -14,6 +14,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
 from cocoro.differential import wheels_of
+from cocoro.joints import GROUPS
 from cocoro.learning.handmap import NominalModel
 from cocoro.messages import (
     BaseCommand,
@@ -190,8 +191,8 @@ class Body:
             turn_rate_radps=(right - left) / self._separation_m, latch="released",
         )  # fmt: skip
         states = [Sample(topics.BASE_STATE, base)]
-        for name, topic in (("arm", topics.ARM_STATE), ("hand", topics.HAND_STATE)):
-            joints = self.robot.network_joints(name)
+        for group, topic in zip(GROUPS, (topics.ARM_STATE, topics.HAND_STATE), strict=True):
+            joints = self.robot.group_joints(group)
             state = ServoState(
                 stamp_ns=self.now_ns, joints=joints, position_rad=tuple(self.angles[joint] for joint in joints),
                 speed_radps=(0.0,) * len(joints), load=(0.0,) * len(joints), latch="released",

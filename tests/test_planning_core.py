@@ -219,10 +219,10 @@ def test_after_a_stop_the_arm_starts_from_where_it_is_found(planner: Planner) ->
 
 @pytest.mark.parametrize("joint", ["neck_tilt", "claw_left", "elbow"])
 def test_a_state_that_lacks_a_joint_is_no_state(planner: Planner, joint: str) -> None:
-    network = ROBOT.joints[joint].network
-    names = tuple(name for name in ROBOT.network_joints(network) if name != joint)
+    group = ROBOT.joints[joint].group
+    names = tuple(name for name, row in ROBOT.joints.items() if row.group == group and name != joint)
     zeros = (0.0,) * len(names)
-    topic = topics.ARM_STATE if network == "arm" else topics.HAND_STATE
+    topic = topics.ARM_STATE if group == "arm" else topics.HAND_STATE
     planner.silent.add(topic.name)
     planner.under_test.feed(
         topic, ServoState(joints=names, position_rad=zeros, speed_radps=zeros, load=zeros, latch="released")

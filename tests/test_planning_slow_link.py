@@ -15,7 +15,7 @@ from services.planning.arm import ArmController, ArmStep
 from services.planning.clearance import Clearance
 from services.planning.config import PlanningConfig
 from services.planning.reach import HandPose, Reacher
-from sim.servos import SimServoNetwork
+from sim.servos import SimServoGroup
 
 ROBOT = Robot.load()
 ARM, ROLL = ROBOT.arm.joints, ROBOT.arm.roll
@@ -79,7 +79,7 @@ def moved_over(delay_s: float, loss: float, seed: int, most_s: float = 40.0) -> 
     rng = random.Random(f"arm/{seed}")
     states, commands = OneWay(delay_s, loss, rng), OneWay(delay_s, loss, rng)
     joints = {name: ROBOT.joints[name] for name in (*ARM, ROLL)}
-    servos = SimServoNetwork(joints, PARKED, keeps_goal=False, timeout_s=MOST_AGE_S)
+    servos = SimServoGroup(joints, PARKED, keeps_goal=False, timeout_s=MOST_AGE_S)
     true = {name: PARKED[name] for name in joints}
     controller = ArmController(ROBOT, CONFIG.arm, REACHER)
     stage, known = 0, (0.0, dict(PARKED))
@@ -107,13 +107,13 @@ def moved_over(delay_s: float, loss: float, seed: int, most_s: float = 40.0) -> 
     return Moved(most_s, False, False, least_m, furthest_m)
 
 
-def obey(servos: SimServoNetwork, step: ArmStep, now_s: float) -> None:
+def obey(servos: SimServoGroup, step: ArmStep, now_s: float) -> None:
     speeds = (*step.speed_radps.tolist(), 2.5)
     for name, goal_rad, speed_radps in zip((*ARM, ROLL), (*step.goal_rad.tolist(), step.roll_rad), speeds, strict=True):
         servos.servos[name].command(goal_rad, speed_radps, round((now_s + MOST_AGE_S) * NS))
 
 
-def follow(servos: SimServoNetwork, true: dict[str, float], now_s: float) -> None:
+def follow(servos: SimServoGroup, true: dict[str, float], now_s: float) -> None:
     """The joints go to their goals, no faster than commanded."""
     dt_s = TICK_S / PHYSICS
     servos.expire(round(now_s * NS))

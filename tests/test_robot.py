@@ -23,8 +23,8 @@ TEXT = resources.files("cocoro").joinpath("calliope.toml").read_text()
 
 
 def test_it_has_the_papers_eleven_degrees_of_freedom() -> None:
-    assert ROBOT.network_joints("arm") == ("neck_pan", "neck_tilt", "arm_base", "shoulder", "elbow", "wrist_pitch")
-    assert ROBOT.network_joints("hand") == ("wrist_roll", "claw_left", "claw_right")
+    assert ROBOT.group_joints("arm") == ("neck_pan", "neck_tilt", "arm_base", "shoulder", "elbow", "wrist_pitch")
+    assert ROBOT.group_joints("hand") == ("wrist_roll", "claw_left", "claw_right")
     assert len(ROBOT.joints) + 2 == 11
 
 

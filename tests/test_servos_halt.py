@@ -12,6 +12,7 @@ from services.servos.dynamixel import DYNAMIXEL
 from services.servos.family import ServoReading
 from services.servos.line import ServoLine
 from services.servos.motion import HOLD_RADPS
+from services.servos.orders import GroupOrders
 
 PATIENCE_S = 60.0
 FAR = {5: (900, 30)}
@@ -58,16 +59,17 @@ class Wire:
             assert self._news.wait_for(lambda: good(self.written), PATIENCE_S)
 
 
-def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
+def scenario(keeps_goal: bool, test: Callable[[GroupOrders, Wire], None]) -> None:
     """Run a test in the event loop's thread, so that the loop is blocked meanwhile."""
 
     async def run() -> None:
         wire = Wire()
-        line = ServoLine("nowhere", 1, DYNAMIXEL, {5: {"torque_limit": 1023}}, 200.0, 0.1, lambda _: None, keeps_goal)
+        orders = GroupOrders(keeps_goal=keeps_goal)
+        line = ServoLine("nowhere", 1, DYNAMIXEL, {5: {"torque_limit": 1023}}, 200.0, 0.1, lambda _: None, [orders])
         line._open = lambda: wire  # type: ignore[assignment, return-value]
         line.start()
         try:
-            test(line, wire)
+            test(orders, wire)
         finally:
             await line.stop()
 
@@ -75,15 +77,15 @@ def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
 
 
 def test_what_is_under_orders_holds_where_it_was_just_read_and_stays_there() -> None:
-    def test(line: ServoLine, wire: Wire) -> None:
-        line.order(FAR)
+    def test(orders: GroupOrders, wire: Wire) -> None:
+        orders.give(FAR)
         wire.until(lambda written: FAR in written)
-        line.halt()
+        orders.halt()
         wire.until(lambda written: written[-1] != FAR)
         held = wire.written[-1]
         assert held[5][0] <= wire.position
         assert held[5][1] == HOLD
-        line.order({5: (1000, 30)})  # of a loop that hung, and does not know yet
+        orders.give({5: (1000, 30)})  # of a loop that hung, and does not know yet
         count = len(wire.written)
         wire.until(lambda written: len(written) > count + 5)
         assert wire.written[count + 1 :] == [held] * len(wire.written[count + 1 :])
@@ -92,23 +94,23 @@ def test_what_is_under_orders_holds_where_it_was_just_read_and_stays_there() -> 
 
 
 def test_who_knows_of_the_stop_gives_the_orders_again() -> None:
-    def test(line: ServoLine, wire: Wire) -> None:
-        line.order(FAR)
-        line.halt()
+    def test(orders: GroupOrders, wire: Wire) -> None:
+        orders.give(FAR)
+        orders.halt()
         wire.until(lambda written: written and written[-1] != FAR)
-        line.order({5: (600, HOLD)})
-        line.go_on()
+        orders.give({5: (600, HOLD)})
+        orders.go_on()
         wire.until(lambda written: written[-1] == {5: (600, HOLD)})
 
     scenario(False, test)
 
 
 def test_a_hand_goes_on_holding_what_it_holds_and_takes_no_new_goals() -> None:
-    def test(line: ServoLine, wire: Wire) -> None:
-        line.order(FAR)
+    def test(orders: GroupOrders, wire: Wire) -> None:
+        orders.give(FAR)
         wire.until(lambda written: FAR in written)
-        line.halt()
-        line.order({5: (100, 30)})
+        orders.halt()
+        orders.give({5: (100, 30)})
         wire.until(lambda written: {} in written)
         count = len(wire.written)
         wire.until(lambda written: len(written) > count + 5)
@@ -118,11 +120,11 @@ def test_a_hand_goes_on_holding_what_it_holds_and_takes_no_new_goals() -> None:
 
 
 def test_what_does_not_answer_just_then_holds_as_soon_as_it_does() -> None:
-    def test(line: ServoLine, wire: Wire) -> None:
-        line.order(FAR)
+    def test(orders: GroupOrders, wire: Wire) -> None:
+        orders.give(FAR)
         wire.until(lambda written: FAR in written)
         wire.misses = 2
-        line.halt()
+        orders.halt()
         wire.until(lambda written: 5 in written[-1] and written[-1] != FAR)
         assert wire.misses == 0
 

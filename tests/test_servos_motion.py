@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cocoro.clock import NS
-from cocoro.description import Joint
+from cocoro.joints import Group, Joint
 from cocoro.messages import ServoCommand
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol
@@ -18,8 +18,8 @@ from services.servos.dynamixel import DYNAMIXEL
 from services.servos.families import FAMILIES
 from services.servos.family import ServoFamily, ServoReading
 from services.servos.feetech import FEETECH
+from services.servos.group import MISSES, ServoGroup, ServoStatus, ServoTask
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
-from services.servos.network import MISSES, ServoNetwork, ServoStatus, ServoTask
 
 ROBOT = Robot.load()
 MS = 1_000_000
@@ -138,7 +138,7 @@ def test_goals_stay_within_the_limits_and_speeds_within_the_servos() -> None:
     assert max(led.speeds) == round(SHOULDER.max_speed_radps / DYNAMIXEL.units.speed_radps)
 
 
-# --- networks --------------------------------------------------------------------------------------
+# --- groups ----------------------------------------------------------------------------------------
 
 
 def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, voltage_v: float = 12.0) -> ServoReading:
@@ -146,12 +146,12 @@ def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, vol
 
 
 class Net:
-    """A network of servos that answer; times are in ms."""
+    """A group of servos that answer; times are in ms."""
 
-    def __init__(self, name: str = "arm", protocol: Protocol = "dynamixel") -> None:
+    def __init__(self, name: Group = "arm", protocol: Protocol = "dynamixel") -> None:
         robot = ROBOT.with_networks(protocol=protocol)
-        joints = [robot.joints[joint] for joint in robot.network_joints(name)]
-        self.net = ServoNetwork(joints, FAMILIES[protocol], keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
+        joints = [robot.joints[joint] for joint in robot.group_joints(name)]
+        self.net = ServoGroup(joints, FAMILIES[protocol], keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
         self.net.port_fault = ""
         self.now_ns = NS
         self.tasks: list[ServoTask] = []
@@ -181,7 +181,7 @@ class Net:
 
 @pytest.fixture
 def arm() -> Net:
-    """A network whose servos were inspected, released and enabled."""
+    """A group whose servos were inspected, released and enabled."""
     arm = Net()
     arm.cycle()
     arm.net.set_latch("released")
@@ -359,7 +359,7 @@ def test_a_clock_that_begins_anew_ends_what_was_commanded(arm: Net) -> None:
 def test_a_command_is_refused_by_the_age_of_its_own_topic() -> None:
     joint = ROBOT.joints["wrist_roll"]
     for max_age_s, answer in ((0.05, "too old"), (0.15, "")):
-        net = ServoNetwork([joint], DYNAMIXEL, keeps_goal=True, timeout_s=0.2, max_age_s=max_age_s)
+        net = ServoGroup([joint], DYNAMIXEL, keeps_goal=True, timeout_s=0.2, max_age_s=max_age_s)
         net.set_latch("released")
         command = ServoCommand(stamp_ns=NS, joints=(joint.name,), goal_rad=(0.1,), speed_radps=(1.0,))
         assert net.command(command, NS + 100 * MS) == answer
@@ -379,7 +379,7 @@ def test_measured_joint_limits_are_what_the_servo_line_keeps(tmp_path: Path) -> 
 def test_direction_and_centre_of_a_joint_are_its_own_and_units_its_familys(family: ServoFamily) -> None:
     units = family.units
     joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0, units=units)
-    net = ServoNetwork([joint], family, keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
+    net = ServoGroup([joint], family, keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
     net.read(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None

@@ -10,7 +10,7 @@ from dynamixel_sdk.protocol1_packet_handler import Protocol1PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol
 from services.servos.bus import asked, find_status

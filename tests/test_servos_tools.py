@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import degrees
@@ -192,8 +193,8 @@ def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: Servo
 def profile(bench: ServoBench, tmp_path: Path) -> Path:
     path = tmp_path / "robbie.toml"
     path.write_text(
-        'robot = "robbie"\nprocesses = ["servos"]\nmeasured = "robbie-measured.toml"\n\n[service.servos]\n'
-        f'arm_port = "{bench.port("arm")}"\nhand_port = "{bench.port("hand")}"\n'
+        'robot = "robbie"\nprocesses = ["servos"]\nmeasured = "robbie-measured.toml"\n\n[service.servos.ports]\n'
+        f'arm = "{bench.port("arm")}"\nhand = "{bench.port("hand")}"\n'
     )
     return path
 
@@ -244,7 +245,7 @@ def test_a_scan_names_what_is_missing_and_writes_ports_where_it_is_told(
     shown = capsys.readouterr().out
     assert "claw_left" in shown
     assert "not found: claw_right (ID 9)" in shown
-    assert f'hand_port = "{bench.port("hand")}"' in copy.read_text()
+    assert tomllib.loads(copy.read_text())["service"]["servos"]["ports"]["hand"] == bench.port("hand")
     assert main([*arguments, "--json"]) == 1
     assert [one["number"] for one in json.loads(capsys.readouterr().out)] == [1, 2, 3, 4, 5, 6, 7, 8]
 
@@ -291,7 +292,7 @@ def test_a_scan_writes_what_protocol_it_found_and_the_other_commands_speak_it(
 
 @both
 def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
-    config = ServosConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
+    config = ServosConfig(port=f"{bench.folder}/{{line}}", reply_s=REPLY_S)
     assert {check.state for check in check_servos(config, bench.robot, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
     bench.put(5, return_delay=250)

@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cocoro.differential import command_of
+from cocoro.joints import Group
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS
 from sim.base import Bumper, MobileBase
 from sim.realism import Wander
 from sim.seeds import stream
-from sim.servos import Backlash, SimServo, SimServoNetwork
+from sim.servos import Backlash, SimServo, SimServoGroup
 
 ROBOT = Robot.load()
 COUNT_RAD = UNITS["dynamixel"].count_rad
@@ -31,10 +32,10 @@ def servo(joint: str = "elbow", angle_rad: float = 0.0, backlash_rad: float = 0.
     return SimServo(ROBOT.joints[joint], angle_rad, backlash_rad)
 
 
-def network(name: str = "arm", backlash_deg: float = 0.0) -> SimServoNetwork:
-    joints = {joint: ROBOT.joints[joint] for joint in ROBOT.network_joints(name)}
+def group(name: Group = "arm", backlash_deg: float = 0.0) -> SimServoGroup:
+    joints = {joint: ROBOT.joints[joint] for joint in ROBOT.group_joints(name)}
     angles = dict.fromkeys(joints, 0.0)
-    return SimServoNetwork(joints, angles, keeps_goal=name == "hand", timeout_s=0.2, backlash_deg=backlash_deg)
+    return SimServoGroup(joints, angles, keeps_goal=name == "hand", timeout_s=0.2, backlash_deg=backlash_deg)
 
 
 def order(goal_rad: float, speed_radps: float = 1.0, joint: str = "elbow") -> ServoCommand:
@@ -70,7 +71,7 @@ def test_the_slowest_command_still_moves_and_speed_zero_holds() -> None:
 
 
 def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
-    arm = network()
+    arm = group()
     arm.command(order(1.0), now_ns=0)
     arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=200 * MS)
     arm.expire(200 * MS)
@@ -85,7 +86,7 @@ def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
 
 
 def test_a_joint_that_is_not_named_any_more_expires_though_others_are() -> None:
-    arm = network()
+    arm = group()
     arm.command(order(1.0), now_ns=0)
     arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=0)
     for tick in range(1, 20):
@@ -96,7 +97,7 @@ def test_a_joint_that_is_not_named_any_more_expires_though_others_are() -> None:
 
 
 def test_the_hand_keeps_its_goal_when_commands_stop_and_when_stopped() -> None:
-    hand = network("hand")
+    hand = group("hand")
     hand.command(order(0.3, joint="claw_left"), now_ns=0)
     hand.servos["claw_left"].sense(0.1, 0.0, 1.0, now_ns=0)
     hand.expire(10_000 * MS)
@@ -107,7 +108,7 @@ def test_the_hand_keeps_its_goal_when_commands_stop_and_when_stopped() -> None:
 
 @pytest.mark.parametrize(("latch", "why"), [("latched", "estop"), ("unknown", "latch unknown")])
 def test_a_stopped_arm_holds_and_refuses_and_says_why(latch: str, why: str) -> None:
-    arm = network()
+    arm = group()
     arm.command(order(1.0), now_ns=0)
     arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=0)
     arm.set_latch(latch)  # type: ignore[arg-type]
@@ -121,14 +122,14 @@ def test_a_stopped_arm_holds_and_refuses_and_says_why(latch: str, why: str) -> N
 
 
 def test_a_command_for_a_joint_of_another_network_is_refused_whole() -> None:
-    arm = network()
+    arm = group()
     command = ServoCommand(joints=("elbow", "claw_left"), goal_rad=(1.0, 1.0), speed_radps=(1.0, 1.0))
     assert "claw_left" in arm.command(command, now_ns=0)
     assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.0, abs=COUNT_RAD)
 
 
 def test_pushing_at_the_limit_for_long_is_an_overload_until_it_is_reset() -> None:
-    arm = network()
+    arm = group()
     elbow = arm.servos["elbow"]
     limit = elbow.joint.torque_nm
     for tick in range(51):

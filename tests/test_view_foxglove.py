@@ -24,6 +24,7 @@ from apps.cli.main import main
 from apps.cli.view_foxglove import Asked
 from cocoro.clock import NS
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.joints import GROUPS
 from cocoro.keys import asker_key
 from cocoro.messages import (
     BaseState,
@@ -132,8 +133,8 @@ def test_the_map_stays_where_the_planner_has_it_when_a_search_has_corrected_the_
 
 def test_links_are_drawn_once_every_joint_is_known() -> None:
     scene = FoxgloveScene(ROBOT, Catalogue.load())
-    for network in ("arm", "hand"):
-        joints = ROBOT.network_joints(network)
+    for group in GROUPS:
+        joints = ROBOT.group_joints(group)
         zeros = (0.0,) * len(joints)
         shown = list(scene.of(ServoState(joints=joints, position_rad=zeros, speed_radps=zeros, load=zeros)))
     assert [made.topic for made in shown] == ["/tf", "/robot/links"]

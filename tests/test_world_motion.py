@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from world_operator import COMMAND_EVERY, EMPTY, ROBOT, Operator, scene_with, yaw_of
 
+from cocoro.joints import GROUPS
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.servo_units import UNITS
 from sim.scene import Obstacle, load_scene
@@ -123,8 +124,8 @@ def test_nothing_flies_apart_when_everything_is_asked_of_it_at_once() -> None:
         operator = Operator(world)
         for _ in range(20):
             arm, hand = (
-                {joint: draws.uniform(*ROBOT.joints[joint].limits_rad) for joint in ROBOT.network_joints(name)}
-                for name in ("arm", "hand")
+                {joint: draws.uniform(*ROBOT.joints[joint].limits_rad) for joint in ROBOT.group_joints(name)}
+                for name in GROUPS
             )
             left, right = draws.uniform(-0.5, 0.5, 2)
             operator.run(0.4, arm=arm, hand=hand, wheels_mps=(left, right), speed_radps=6.0)

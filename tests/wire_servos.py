@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from cocoro import topics
 from cocoro.clock import RealClock
+from cocoro.joints import GROUPS
 from cocoro.messages import Latch, ServoCommand, ServoState
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol
@@ -20,7 +21,7 @@ from cocoro.topics import Topic
 from services.servos.bus import ServoBus
 from services.servos.families import FAMILIES
 from sim.wire.emulator import Emulator, SimplePlant
-from sim.wire.models import model_of, servo_of
+from sim.wire.models import model_of, servo_of, servos_on_lines
 from sim.wire.servo import EmulatedServo, EmulatedServoBus
 
 T = TypeVar("T")
@@ -29,7 +30,6 @@ MS = 1_000_000
 LONG_S = 30.0
 REPLY_S = 0.2
 """Time limit for answers on a busy machine."""
-ARM, HAND = (1, 2, 3, 4, 5, 6), (7, 8, 9)
 WHEEL = {"dynamixel": {"low_limit": 0, "high_limit": 0}, "feetech": {"mode": 1}}
 """By protocol, the registers with which a servo turns endlessly."""
 STATE: dict[str, Topic[ServoState]] = {"arm": topics.ARM_STATE, "hand": topics.HAND_STATE}
@@ -37,17 +37,25 @@ COMMAND: dict[str, Topic[ServoCommand]] = {"arm": topics.ARM_COMMAND, "hand": to
 
 
 class ServoBench:
-    """Two emulated lines with a Calliope's servos, of one family, and a plant without physics; a context manager."""
+    """The emulated lines of a robot, the Calliope by default, with servos of one family, and a plant without physics; a
+    context manager."""
 
-    def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0, protocol: Protocol = "dynamixel") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        seed: int = 0,
+        overload_s: float = 5.0,
+        protocol: Protocol = "dynamixel",
+        robot: Robot | None = None,
+    ) -> None:
         self.family, self.units = FAMILIES[protocol], UNITS[protocol]
-        self.robot = Robot.load().with_networks(protocol=protocol)
-        self.arm, self.hand = (
-            EmulatedServoBus([servo_of(model_of(name, protocol), number, overload_s) for number in numbers])
-            for name, numbers in (("arm", ARM), ("hand", HAND))
-        )
-        self.body = SimplePlant(None, self.arm, self.hand)
-        self.emulator = Emulator(folder, {"arm": self.arm, "hand": self.hand}, self.body, seed)
+        self.robot = (robot or Robot.load()).with_networks(protocol=protocol)
+        self.buses = {
+            line: EmulatedServoBus(servo_of(model_of(joint.group, protocol), joint.id, overload_s) for joint in joints)
+            for line, (protocol, joints) in servos_on_lines(self.robot).items()
+        }
+        self.body = SimplePlant(None, *self.buses.values())
+        self.emulator = Emulator(folder, self.buses, self.body, seed)
         self.folder = folder
 
     def __enter__(self) -> ServoBench:
@@ -61,7 +69,7 @@ class ServoBench:
         return str(self.folder / name)
 
     def servo(self, number: int) -> EmulatedServo:
-        return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
+        return next(servo for bus in self.buses.values() for servo in bus.servos if servo.number == number)
 
     def bus(self, name: str = "arm", reply_s: float = REPLY_S, baud: int = 1_000_000, tries: int = 1) -> ServoBus:
         """A driver of a line."""
@@ -164,11 +172,12 @@ def angle(state: ServoState, joint: str) -> float:
 @asynccontextmanager
 async def inspected(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
     """The servo service on both lines, all servos read, the emergency stop released."""
-    settings = {"arm_port": bench.port("arm"), "hand_port": bench.port("hand"), "reply_s": REPLY_S} | config
+    settings = {"ports": {line: bench.port(line) for line in bench.robot.networks}, "reply_s": REPLY_S} | config
     async with ServiceUnderTest("services.servos.service", settings, robot=bench.robot, clock=RealClock()) as service:
         servos = Moved(bench, service)
-        await servos.state("arm", lambda state: len(state.joints) == len(ARM))
-        await servos.state("hand", lambda state: len(state.joints) == len(HAND))
+        for group in GROUPS:
+            joints = bench.robot.group_joints(group)
+            await servos.state(group, lambda state, joints=joints: state.joints == joints)  # type: ignore[misc]
         servos.release()
         yield servos
         servos.silence()
@@ -178,6 +187,6 @@ async def inspected(bench: ServoBench, **config: object) -> AsyncIterator[Moved]
 async def moved(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
     """The same, and all servos hold."""
     async with inspected(bench, **config) as servos:
-        for network in ("arm", "hand"):
-            await servos.state(network, lambda state: state.torque_enabled and all(state.torque_enabled))
+        for group in GROUPS:
+            await servos.state(group, lambda state: state.torque_enabled and all(state.torque_enabled))
         yield servos

@@ -9,6 +9,7 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.differential import command_of
+from cocoro.joints import GROUPS
 from cocoro.messages import ServoCommand, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.judge import Judge
@@ -47,7 +48,7 @@ class Operator:
     ) -> None:
         for step in range(round(seconds * 240)):
             if step % COMMAND_EVERY == 0:
-                for name, goals in (("arm", arm), ("hand", hand)):
+                for name, goals in zip(GROUPS, (arm, hand), strict=True):
                     if goals:
                         self.world.command_servos(
                             name,

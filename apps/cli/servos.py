@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
@@ -28,8 +28,8 @@ from apps.cli.output import complain, print_json, tell
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.component import load
-from cocoro.description import Joint
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
+from cocoro.joints import GROUPS, Group, Joint
 from cocoro.messages import ServoReply, ServoRequest
 from cocoro.ports import port_path
 from cocoro.robot import Robot
@@ -41,7 +41,6 @@ from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.families import FAMILIES
 
-NETWORKS = ("arm", "hand")
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
 NOBODY = "this command waits for a person at a terminal, but standard input has ended"
 REPLY_S = 0.05
@@ -109,48 +108,51 @@ def hold(
 
 
 async def request(choice: RobotChoice, action: str, joints: list[str], as_json: bool = False) -> int:
-    """Sends an action to the networks that have these joints; the exit code is 3 when one could not do it.
+    """Sends an action to the groups that have these joints; the exit code is 3 when one could not do it.
 
-    Raises MeshError when a network's service is not running, ConfigError for an unknown joint.
+    Raises MeshError when a group's service is not running, ConfigError for an unknown joint and for one of no group.
     """
     code, done = exits.DONE, list[dict[str, Any]]()
     async with joined(choice) as link:
-        networks = _networks_of(joints, link.described())
+        groups = _groups_of(joints, link.described())
         alive = await link.alive()
-        missing = [network for network in networks if network not in alive]
+        missing = [group for group in groups if group not in alive]
         if missing:
             raise MeshError(link.missing(missing[0]))
-        for network, names in networks.items():
-            reply = await _request_one(link, network, action, names)
-            done.append({"network": network, "done": DONE_WORDS[action], "joints": reply.joints, "problem": reply.text})
+        for group, names in groups.items():
+            reply = await _request_one(link, group, action, names)
+            done.append({"group": group, "done": DONE_WORDS[action], "joints": reply.joints, "problem": reply.text})
             if not as_json:
-                print(f"{network}: {DONE_WORDS[action]}: {', '.join(reply.joints) or 'none'}")
+                print(f"{group}: {DONE_WORDS[action]}: {', '.join(reply.joints) or 'none'}")
             if reply.text:
-                complain(f"{network}: {reply.text}")
+                complain(f"{group}: {reply.text}")
                 code = exits.REFUSED
     if as_json:
         print_json(done)
     return code
 
 
-async def _request_one(link: MeshLink, network: str, action: str, joints: list[str]) -> ServoReply:
+async def _request_one(link: MeshLink, group: Group, action: str, joints: list[str]) -> ServoReply:
     question = ServoRequest(action=action, joints=tuple(joints))  # type: ignore[arg-type] # one of three, by the command
     try:
-        return await link.call(SERVOS.of(network), question)
+        return await link.call(SERVOS.of(group), question)
     except MeshError as error:
-        raise MeshError(f"{network} does not answer `{action}`; only real servos do, not simulated ones") from error
+        raise MeshError(f"{group} does not answer `{action}`; only real servos do, not simulated ones") from error
 
 
-def _networks_of(joints: list[str], robot: Robot) -> dict[str, list[str]]:
-    """Joints by network; no joints stand for all of both networks. Raises ConfigError for an unknown joint."""
+def _groups_of(joints: list[str], robot: Robot) -> dict[Group, list[str]]:
+    """Joints by group; no joints stand for all of all groups. Raises ConfigError for an unknown joint, and for one that
+    no command addresses."""
     known = robot.joints
     if unknown := [joint for joint in joints if joint not in known]:
         raise ConfigError(f"there is no joint {unknown[0]!r}; {choice_of(unknown[0], known)}")
     if not joints:
-        return {network: [] for network in NETWORKS}
-    found: dict[str, list[str]] = {}
+        return {group: [] for group in GROUPS}
+    found: dict[Group, list[str]] = {}
     for joint in joints:
-        found.setdefault(cast(str, known[joint].network), []).append(joint)
+        if (group := known[joint].group) is None:
+            raise ConfigError(f"{joint} is no joint of arm or hand, so no command addresses it")
+        found.setdefault(group, []).append(joint)
     return found
 
 
@@ -164,7 +166,7 @@ class ServoWorkbench:
     profile: Profile
     robot: Robot
     ports: dict[str, str]
-    """Serial port by network."""
+    """Serial port by line."""
     file: Path
 
     @classmethod
@@ -177,9 +179,7 @@ class ServoWorkbench:
         existing = measured if measured is not None and measured.exists() else None
         robot = Robot.load(description, existing)
         config = profile.config("servos", load(named("servos")).config)
-        ports: dict[str, str] = {
-            name: port_path(getattr(config, f"{name}_port"), profile.robot) for name in robot.networks
-        }
+        ports = {line: port_path(config.port_of(line), profile.robot) for line in robot.networks}
         return cls(profile, robot, ports, write or measured or Path(f"{profile.robot}-measured.toml"))
 
     def joint(self, name: str) -> Joint:
@@ -265,26 +265,26 @@ def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
 
 
 def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint], file: Path) -> None:
-    """Writes each network's port into a profile, and what differs of baud rate and protocol into the measured file."""
-    for network, row in bench.robot.networks.items():
-        own = [one for one in found if one.number in names and names[one.number].network == network]
+    """Writes each line's port into a profile, and what differs of baud rate and protocol into the measured file."""
+    for line, row in bench.robot.networks.items():
+        own = [one for one in found if one.number in names and names[one.number].network == line]
         places = {(one.port, one.baud, one.protocol) for one in own}
         if not places:
             continue
         if len(places) > 1:
             raise RefusedError(
-                f"the servos of {network} are on several lines ({sorted(places)}), so no port was written; connect"
+                f"the servos of {line} are on several lines ({sorted(places)}), so no port was written; connect"
                 " them to one line, or write the profile by hand"
             )
         port, baud, protocol = places.pop()
-        print(f"{network}_port = {port}, {baud} baud", flush=True)
-        write_values(file, "service.servos", {f"{network}_port": port})
+        print(f"{line}: {port}, {baud} baud", flush=True)
+        write_values(file, "service.servos.ports", {line: port})
         print(f"the port is written to {file}")
         if baud != row.baud:
-            write_values(bench.file, f"network.{network}", {"baud": baud})
+            write_values(bench.file, f"network.{line}", {"baud": baud})
             print(f"the baud rate is written to {bench.file}")
         if protocol != row.protocol:
-            write_values(bench.file, f"network.{network}", {"protocol": protocol})
+            write_values(bench.file, f"network.{line}", {"protocol": protocol})
             print(f"its protocol, {protocol}, is written to {bench.file}")
 
 

@@ -1,1 +1,1 @@
-"""The servos: families (data), bus, the thread of a line, motion and network (pure), and the service."""
+"""The servos: families (data), bus, the thread of a line, motion and group (pure), and the service."""

@@ -6,7 +6,7 @@ from cocoro.component import Component
 SERVOS = Component(
     name="servos",
     module="services.servos.service",
-    doc="Both servo networks: neck and arm, hand.",
+    doc="The servo groups: neck and arm, hand.",
     services=("arm", "hand"),
     reads=(topics.ARM_COMMAND, topics.HAND_COMMAND, topics.LATCH),
     publishes=(topics.ARM_STATE, topics.HAND_STATE),

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from cocoro.checks import Check, bad, note, ok
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from cocoro.ports import check_port, port_path
 from cocoro.robot import Robot
 from services.servos import tools
 from services.servos.bus import PortError, ServoBus, SilentError
 from services.servos.families import FAMILIES
 from services.servos.family import ServoFamily
-from services.servos.network import HOT_C
-from services.servos.service import NETWORKS, ServosConfig
+from services.servos.group import HOT_C
+from services.servos.service import ServosConfig
 
 __all__ = ["check"]
 
 
 def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
     checks: list[Check] = []
-    for name in NETWORKS:
-        port = config.arm_port if name == "arm" else config.hand_port
+    for name, row in robot.networks.items():
+        port = config.port_of(name)
         checked = check_port(name, port, robot_name, quick=True)
         checks += checked
         if checked[0].state == "ok":
             joints = [robot.joints[joint] for joint in robot.network_joints(name)]
-            row = robot.networks[name]
             path, family = port_path(port, robot_name), FAMILIES[row.protocol]
             checks += _servos(name, path, row.baud, family, joints, config.reply_s)
     return checks
@@ -58,7 +57,7 @@ def _servo(bus: ServoBus, baud: int, family: ServoFamily, joint: Joint) -> Check
         wrong.append(
             f"answers after {found.return_delay_us} us: set that to 0 by `cocoro servos set-id {joint.id} {joint.id}`"
         )
-    if found.is_wheel:
+    if found.is_wheel and joint.group is not None:
         wrong.append("is set up as a wheel: give it limits, or its mode 0, with its maker's program")
     if not family.volts[0] <= found.voltage_v <= family.volts[1]:
         wrong.append("bad voltage: check the supply")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import radians
 
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from services.servos.family import Register, ServoFamily, Signs, kept
 
 REGISTERS: dict[str, Register] = {

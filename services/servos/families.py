@@ -1,4 +1,4 @@
-"""The families of servos by the protocol that a network's description names."""
+"""The families of servos by the protocol that a line's description names."""
 
 from __future__ import annotations
 

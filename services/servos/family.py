@@ -1,6 +1,6 @@
 """What differs between the families of servos, as data, and the decoding of their registers. Pure.
 
-A family's control table is in a module of its own (`dynamixel`, `feetech`). Bus, line, motion, network and tools are
+A family's control table is in a module of its own (`dynamixel`, `feetech`). Bus, line, motion, group and tools are
 the same for all of them: they know registers by the names that the tables share.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from cocoro.servo_units import UNITS, Protocol, ServoUnits
 
 

@@ -13,7 +13,7 @@ from a Dynamixel in what a driver must know:
 
 from __future__ import annotations
 
-from cocoro.description import Joint
+from cocoro.joints import Joint
 from services.servos.family import Register, ServoFamily, Signs, kept
 
 REGISTERS: dict[str, Register] = {

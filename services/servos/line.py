@@ -1,7 +1,7 @@
 """The thread that talks to a servo line, so that the event loop never waits for a wire.
 
 In each cycle it writes the newest orders by one sync write, reads every servo, and does at most one task. It passes the
-results to the event loop as a `CycleResult`. The two share only the newest orders and the queue of tasks.
+results to the event loop as a `CycleResult`. The two share only the orders of the line's groups and the queue of tasks.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from queue import Empty, SimpleQueue
 
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.family import ServoFamily, ServoReading
+from services.servos.group import MISSES, ServoStatus, ServoTask
 from services.servos.motion import HOLD_RADPS
-from services.servos.network import MISSES, ServoStatus, ServoTask
+from services.servos.orders import GroupOrders
 
 log = logging.getLogger("cocoro.servos")
 
@@ -27,8 +28,6 @@ PROBE_S = 0.2
 """Period at which one silent servo is tried again. More often would take too much time from the others."""
 CHECK_CYCLES = 8
 """Once in this many cycles the settings of one servo are checked."""
-ORDERS_S = 0.2
-"""Orders expire when they are not renewed for this long, as when the event loop hangs."""
 STATE = "torque_enable", "torque_limit"
 """The first and the last register of a servo's state. Its length differs from that of a reading."""
 
@@ -51,6 +50,19 @@ class CycleResult:
     """Duration of the cycle."""
     strays: int = 0
 
+    def of(self, numbers: Container[int]) -> CycleResult:
+        """What it says of the line, and of these servos."""
+        return replace(
+            self,
+            readings={number: reading for number, reading in self.readings.items() if number in numbers},
+            missed=[number for number in self.missed if number in numbers],
+            inspected={number: status for number, status in self.inspected.items() if number in numbers},
+            checked={number: as_set for number, as_set in self.checked.items() if number in numbers},
+            done=[(task, position) for task, position in self.done if task.number in numbers],
+            failed=[task for task in self.failed if task.number in numbers],
+            refused=[(task, why) for task, why in self.refused if task.number in numbers],
+        )
+
 
 class ServoLine:
     """Calls `on_cycle(result)` in the event loop in which it was made. Call `start`, and `stop` at the end."""
@@ -64,24 +76,20 @@ class ServoLine:
         rate_hz: float,
         reply_s: float,
         on_cycle: Callable[[CycleResult], None],
-        keeps_goal: bool = False,
+        orders: Sequence[GroupOrders],
     ) -> None:
-        """`settings`: by servo ID, the registers that are written before the servo is enabled. `keeps_goal`: when
-        halted, servos still go to their last goal, so that the hand keeps its grip."""
+        """`settings`: by servo ID, the registers that are written before the servo is enabled. `orders`: those of each
+        group whose servos are on the line."""
         self._open: Callable[[], ServoBus] = lambda: ServoBus(path, baud, reply_s, family)
         self._family = family
         self._hold_speed = round(HOLD_RADPS / family.units.speed_radps)
         self._settings = settings
         self._period_s = 1.0 / rate_hz
         self._on_cycle = on_cycle
-        self._keeps_goal = keeps_goal
+        self._orders = orders
         self._loop = asyncio.get_running_loop()
         self._ended = threading.Event()
         self._tasks: SimpleQueue[ServoTask] = SimpleQueue()
-        self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
-        self._halted = False
-        self._held: dict[int, tuple[int, int]] = {}
-        """Position at which each servo is held since the line was halted, and the speed to hold it with; counts."""
         self._misses = dict.fromkeys(settings, 0)
         self._probed_s = 0.0
         self._next_probe = 0
@@ -94,19 +102,6 @@ class ServoLine:
     async def stop(self) -> None:
         self._ended.set()
         await self._loop.run_in_executor(None, self._thread.join, 5.0)
-
-    def order(self, goals: Mapping[int, tuple[int, int]]) -> None:
-        """Set goal and speed, counts, by servo ID. Must be renewed within `ORDERS_S`."""
-        self._orders = (time.monotonic() + ORDERS_S, goals)  # one assignment: the thread sees the old or the new
-
-    def halt(self) -> None:
-        """Stop writing orders, and make moving servos hold where they are. Thread-safe, and independent of the event
-        loop."""
-        self._halted = True
-
-    def go_on(self) -> None:
-        """Write orders again. Call it after `order` with orders that respect the emergency stop."""
-        self._halted = False
 
     def do(self, task: ServoTask) -> None:
         """Queue a task."""
@@ -140,8 +135,7 @@ class ServoLine:
             self._order(bus, started_s)
             for number in self._to_read(started_s):
                 self._read(bus, number, result)
-            if self._halted:
-                self._hold(bus, result.readings)
+            self._hold(bus, result.readings)
             self._do_task(bus, result)
             self._check(bus, result)
             result.busy_s = time.monotonic() - started_s
@@ -150,23 +144,19 @@ class ServoLine:
             due_s = max(due_s + self._period_s, time.monotonic())
 
     def _order(self, bus: ServoBus, now_s: float) -> None:
-        """Write the newest orders; when halted, the positions at which the servos are held."""
-        if not self._halted:
-            self._held = {}
-            until_s, goals = self._orders
-            if now_s < until_s:
-                bus.go(goals)
-        else:
-            bus.go(self._held)
+        """Write what is due of all groups' orders."""
+        goals: dict[int, tuple[int, int]] = {}
+        for one in self._orders:
+            goals |= one.due(now_s)
+        bus.go(goals)
 
     def _hold(self, bus: ServoBus, readings: Mapping[int, ServoReading]) -> None:
-        """Make the servos under orders hold where they were just read. A servo that does not answer follows in a later
-        cycle. A line that keeps its goals holds nothing: it just takes no new goals."""
-        ordered = () if self._keeps_goal else self._orders[1]
-        new = [number for number in ordered if number in readings and number not in self._held]
-        if new:
-            self._held |= {number: (readings[number].position, self._hold_speed) for number in new}
-            bus.go(self._held)
+        """Make the servos that were halted hold where they were just read."""
+        held: dict[int, tuple[int, int]] = {}
+        for one in self._orders:
+            held |= one.hold(readings, self._hold_speed)
+        if held:
+            bus.go(held)
 
     def _to_read(self, now_s: float) -> Collection[int]:
         """The servos to read in this cycle: all that answer, and at times one of those that do not."""

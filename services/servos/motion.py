@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import radians
 
 from cocoro.clock import NS
-from cocoro.description import Joint
+from cocoro.joints import Joint
 
 LEAD_S = 0.2
 REACH_RAD = 0.4

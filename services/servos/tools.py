@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from serial.tools import list_ports
 
-from cocoro.description import Joint
 from cocoro.errors import CocoroError, RefusedError
+from cocoro.joints import Joint
 from cocoro.servo_units import Protocol
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.families import FAMILIES

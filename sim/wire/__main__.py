@@ -1,6 +1,7 @@
 """Emulates a Create and a Calliope's servos without physics, until Ctrl-C: `python -m sim.wire DIR`.
 
-For first steps with the tools. It makes the ports `create`, `arm` and `hand` in DIR, and the socket `control` (see
+For first steps with the tools. It makes in DIR the port `create` and one for each of the robot's lines (`arm`
+and `hand`), and the socket `control` (see
 `sim.wire.control`).
 """
 
@@ -16,7 +17,7 @@ from cocoro.robot import Robot
 from sim.wire.control import Control, ControlServer
 from sim.wire.create import EmulatedCreate
 from sim.wire.emulator import Emulator, SimplePlant
-from sim.wire.models import model_of, servo_of
+from sim.wire.models import model_of, servo_of, servos_on_lines
 from sim.wire.servo import EmulatedServoBus
 
 
@@ -30,16 +31,15 @@ def main() -> int:
     options = parser.parse_args()
     folder: Path = options.folder
     try:
-        robot = Robot.load(options.description, options.measured)
+        lines = servos_on_lines(Robot.load(options.description, options.measured))
     except ConfigError as error:
         parser.error(str(error))
     create = EmulatedCreate()
     buses = {
-        name: EmulatedServoBus(
-            servo_of(model_of(name, network.protocol), joint.id, joint.overload_s)
-            for joint in (robot.joints[row] for row in robot.network_joints(name))
+        line: EmulatedServoBus(
+            servo_of(model_of(joint.group, protocol), joint.id, joint.overload_s) for joint in joints
         )
-        for name, network in robot.networks.items()
+        for line, (protocol, joints) in lines.items()
     }
     emulator = Emulator(folder, {"create": create, **buses}, SimplePlant(create, *buses.values()))
     with ControlServer(folder, Control(emulator)), suppress(KeyboardInterrupt):

@@ -1,18 +1,38 @@
-"""Which servos are emulated on a network."""
+"""Which servos are emulated on which line."""
 
 from __future__ import annotations
 
+from cocoro.errors import ConfigError
+from cocoro.joints import Group, Joint
+from cocoro.robot import Robot
 from cocoro.servo_units import Protocol
 from sim.wire.dynamixel import EmulatedDynamixel
 from sim.wire.feetech import EmulatedFeetech
 from sim.wire.servo import EmulatedServo
 
+OTHERS = ("create", "control")
+"""What stands beside the lines' ports: the Create's port, and the socket of `sim.wire.control`."""
 
-def model_of(network: str, protocol: Protocol) -> int:
-    """The model number of a network's servos: an RX-28 in the arm and an AX-12 elsewhere, or an STS3215."""
+
+def servos_on_lines(robot: Robot) -> dict[str, tuple[Protocol, list[Joint]]]:
+    """By line, what its servos speak, and their joints. Raises ConfigError for a line that is called as what stands
+    beside its port, and for servos that have one ID, by which the emulation tells those of all lines apart."""
+    if taken := sorted(set(OTHERS) & set(robot.networks)):
+        raise ConfigError(f"network {taken[0]}: no line of this name can be emulated, choose another one")
+    lines, by_number = dict[str, tuple[Protocol, list[Joint]]](), dict[int, Joint]()
+    for line, network in robot.networks.items():
+        lines[line] = network.protocol, [robot.joints[name] for name in robot.network_joints(line)]
+        for joint in lines[line][1]:
+            if (other := by_number.setdefault(joint.id, joint)) is not joint:
+                raise ConfigError(f"joints {other.name} and {joint.name} have the ID {joint.id}: not emulated")
+    return lines
+
+
+def model_of(group: Group | None, protocol: Protocol) -> int:
+    """The model number of the servos of a group's joints: an RX-28 in the arm and an AX-12 elsewhere, or an STS3215."""
     if protocol == "feetech":
         return 777
-    return 28 if network == "arm" else 12
+    return 28 if group == "arm" else 12
 
 
 def servo_of(model: int, number: int, overload_s: float) -> EmulatedServo:

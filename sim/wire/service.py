@@ -12,8 +12,9 @@ from pathlib import Path
 
 from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.component import Implementation
-from cocoro.description import Base, Joint
+from cocoro.description import Base
 from cocoro.errors import CocoroError
+from cocoro.joints import GROUPS, Group, Joint
 from cocoro.node import Node
 from cocoro.ports import wire_dir
 from cocoro.robot import Robot
@@ -21,11 +22,11 @@ from sim.base import MobileBase
 from sim.camera import SimKinect
 from sim.realism import BodyRealism
 from sim.service import SimConfig, Simulator, keep_going, make_kinect, make_world
-from sim.servos import Drive, SimServo, SimServoNetwork
+from sim.servos import Drive, SimServo, SimServoGroup
 from sim.wire.firmware import Channel, MotorOrders, PlantState, ServoSetup, Setup
-from sim.wire.models import model_of
+from sim.wire.models import model_of, servos_on_lines
 from sim.wire.servo import Motor
-from sim.world import NETWORKS, Motors, World
+from sim.world import Motors, World
 
 LIMP_SHARE = 0.05
 """Friction of a limp servo's gears, as a share of its stall torque."""
@@ -60,7 +61,7 @@ class WireServo(SimServo):
         return self.count, round(sign * self.speed_radps / self.joint.units.speed_radps), sign * self.load
 
 
-class WireNetwork(SimServoNetwork):
+class WireGroup(SimServoGroup):
     """Servos that are driven only by registers: the driver handles commands, expiry and the emergency stop."""
 
     def __init__(self, joints: Mapping[str, Joint], angles_rad: Mapping[str, float], backlash_deg: float) -> None:
@@ -94,15 +95,14 @@ class WireMotors:
     servos: dict[int, WireServo]
 
     def make(self, robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
-        networks: dict[str, SimServoNetwork] = {}
+        groups: dict[Group, SimServoGroup] = {}
         self.base = WireBase(robot.base)
         self.servos = {}
-        for name in NETWORKS:
-            joints = {joint: robot.joints[joint] for joint in robot.network_joints(name)}
-            network = WireNetwork(joints, angles_rad, realism.backlash_deg)
-            networks[name] = network
-            self.servos |= network.wired
-        return Motors(self.base, networks)
+        for name in GROUPS:
+            joints = {joint: robot.joints[joint] for joint in robot.group_joints(name)}
+            groups[name] = group = WireGroup(joints, angles_rad, realism.backlash_deg)
+            self.servos |= group.wired
+        return Motors(self.base, groups)
 
 
 START_S, END_S = 30.0, 3.0
@@ -150,12 +150,15 @@ class WireSimulator(Simulator):
 
 
 def setup_of(robot: Robot, motors: WireMotors, seed: int) -> Setup:
+    """The firmware's devices: the Create, and by line the servos of all groups. Raises ConfigError as
+    `servos_on_lines` does."""
     lines = {
-        name: [
-            ServoSetup(joint.id, model_of(name, network.protocol), joint.overload_s, motors.servos[joint.id].count)
-            for joint in (robot.joints[row] for row in robot.network_joints(name))
+        line: [
+            ServoSetup(joint.id, model_of(joint.group, protocol), joint.overload_s, motors.servos[joint.id].count)
+            for joint in joints
+            if joint.group is not None
         ]
-        for name, network in robot.networks.items()
+        for line, (protocol, joints) in servos_on_lines(robot).items()
     }
     return Setup(robot.base.wheel_separation_m * 1000.0, lines, seed)
 

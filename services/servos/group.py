@@ -1,4 +1,4 @@
-"""The core of a servo network's service: commands and readings in, orders, state and faults out. Pure.
+"""The core of a servo group's service: commands and readings in, orders, state and faults out. Pure.
 
 The line gets two kinds of work: `orders`, which it writes in every cycle, and tasks, each done once with one servo.
 """
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cocoro.clock import NS, is_fresh
-from cocoro.description import Joint
 from cocoro.health import WINDOW_S, Recent
+from cocoro.joints import Joint
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
 from services.servos.family import ServoFamily, ServoReading
@@ -84,8 +84,8 @@ class ServoJoint:
         return self.inspected and self.enabled and not self.relaxed and not self.fault and not self.silent
 
 
-class ServoNetwork:
-    """All servos of a line. Every `now_ns` is the robot's clock."""
+class ServoGroup:
+    """The servos of one group, all on one line. Every `now_ns` is the robot's clock."""
 
     def __init__(
         self, joints: Iterable[Joint], family: ServoFamily, *, keeps_goal: bool, timeout_s: float, max_age_s: float
@@ -116,7 +116,7 @@ class ServoNetwork:
         if not is_fresh(command.stamp_ns, now_ns, self._max_age_s):
             return "too old"
         if unknown := [name for name in command.joints if name not in self._by_name]:
-            return f"no joint {unknown[0]!r} on this network, which has {', '.join(self._by_name)}"
+            return f"no joint {unknown[0]!r} in this group, which has {', '.join(self._by_name)}"
         until_ns = min(command.stamp_ns, now_ns) + self._timeout_ns
         for name, goal_rad, speed_radps in zip(command.joints, command.goal_rad, command.speed_radps, strict=True):
             one = self._by_name[name]
