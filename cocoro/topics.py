@@ -301,7 +301,7 @@ RECOVER = Request(
 )  # fmt: skip
 SERVOS = Request(
     "{service}/servos", m.ServoRequest, m.ServoReply,
-    "Clear faults, relax or hold joints; answered by each real servo network.",
+    "Clear faults, relax or hold joints; answered by each group of real servos.",
     timeout_s=3.0,
 )  # fmt: skip
 PACKED = Request(

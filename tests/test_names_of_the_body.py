@@ -29,6 +29,14 @@ def renamed() -> str:
     return re.sub(rf"\b({'|'.join(sorted(NAMES, key=len, reverse=True))})\b", r"its_\1", DESCRIPTION)
 
 
+def on_one_line(description: str) -> str:
+    """The description with all servos on one line of another name."""
+    table = r"\[network\.(\w+)\]\n(?:\w.*\n)+"
+    first = next(re.finditer(table, description))
+    others = re.sub(table, lambda found: found[0] if found[1] == first[1] else "", description)
+    return re.sub(r'network = "\w+"', 'network = "bus"', others.replace(f"[network.{first[1]}]", "[network.bus]"))
+
+
 def test_the_names_stand_in_the_description_alone() -> None:
     found = []
     for folder in ("cocoro", "services", "sim", "deploy", "apps"):
@@ -47,9 +55,10 @@ def test_the_renamed_description_has_no_former_name() -> None:
 
 
 @pytest.mark.sim
-def test_a_robot_with_other_names_fetches_as_the_calliope_does(tmp_path: Path) -> None:
+def test_a_robot_with_other_names_and_one_line_fetches_as_the_calliope_does(tmp_path: Path) -> None:
     file = tmp_path / "renamed.toml"
-    file.write_text(renamed(), encoding="utf-8")
+    file.write_text(on_one_line(renamed()), encoding="utf-8")
+    assert [*Robot.load(file).networks] == ["bus"]
     task = FetchTask(label="red_can")
     one, other = (
         rehearse(

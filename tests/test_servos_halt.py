@@ -10,7 +10,8 @@ from types import TracebackType
 from services.servos.bus import SilentError
 from services.servos.dynamixel import DYNAMIXEL
 from services.servos.family import ServoReading
-from services.servos.line import ServoLine
+from services.servos.group import ServoStatus, ServoTask
+from services.servos.line import CycleResult, ServoLine
 from services.servos.motion import HOLD_RADPS
 from services.servos.orders import GroupOrders
 
@@ -59,13 +60,15 @@ class Wire:
             assert self._news.wait_for(lambda: good(self.written), PATIENCE_S)
 
 
-def scenario(keeps_goal: bool, test: Callable[[GroupOrders, Wire], None]) -> None:
-    """Run a test in the event loop's thread, so that the loop is blocked meanwhile."""
+def scenario(keeps_goal: bool, test: Callable[[GroupOrders, Wire], None], *groups: GroupOrders) -> None:
+    """Run a test in the event loop's thread, so that the loop is blocked meanwhile. The line carries these groups; by
+    default one, which the test gets."""
 
     async def run() -> None:
         wire = Wire()
         orders = GroupOrders(keeps_goal=keeps_goal)
-        line = ServoLine("nowhere", 1, DYNAMIXEL, {5: {"torque_limit": 1023}}, 200.0, 0.1, lambda _: None, [orders])
+        settings = {5: {"torque_limit": 1023}}
+        line = ServoLine("nowhere", 1, DYNAMIXEL, settings, 200.0, 0.1, lambda _: None, groups or [orders])
         line._open = lambda: wire  # type: ignore[assignment, return-value]
         line.start()
         try:
@@ -129,3 +132,37 @@ def test_what_does_not_answer_just_then_holds_as_soon_as_it_does() -> None:
         assert wire.misses == 0
 
     scenario(False, test)
+
+
+def test_one_group_of_a_line_is_halted_while_the_other_goes_on() -> None:
+    arm, hand = GroupOrders(), GroupOrders(keeps_goal=True)
+
+    def test(_: GroupOrders, wire: Wire) -> None:
+        arm.give(FAR)
+        hand.give({7: (300, 20)})
+        wire.until(lambda written: {**FAR, 7: (300, 20)} in written)
+        arm.halt()
+        wire.until(lambda written: written[-1].get(5, FAR[5]) != FAR[5])
+        hand.give({7: (350, 20)})
+        wire.until(lambda written: written[-1].get(7) == (350, 20))
+        assert wire.written[-1][5][1] == HOLD
+        hand.halt()
+        count = len(wire.written)
+        wire.until(lambda written: len(written) > count + 5)
+        assert [*wire.written[-1]] == [5]
+
+    scenario(False, test, arm, hand)
+
+
+def test_of_a_cycles_results_each_group_gets_those_of_its_servos() -> None:
+    read = {number: ServoReading(0, 512, 0, 0, 12, 38, 0) for number in (5, 7)}
+    status, task, other = ServoStatus(True, 1, 1, 0), ServoTask("enable", 5), ServoTask("enable", 7)
+    whole = CycleResult(
+        read, [5, 7], {5: status, 7: status}, {5: True, 7: False}, [(task, 1), (other, 2)], [task, other],
+        [(task, "no"), (other, "no")], "broken", 0.01, 3,
+    )  # fmt: skip
+    mine = CycleResult(
+        {7: read[7]}, [7], {7: status}, {7: False}, [(other, 2)], [other], [(other, "no")], "broken", 0.01, 3
+    )
+    assert whole.of({7}) == mine
+    assert whole.of({5, 7}) == whole

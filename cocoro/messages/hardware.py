@@ -104,7 +104,7 @@ class BaseCommand(Message):
 
 
 class ServoState(Message):
-    """The state of one servo network at one time. Every tuple is in the order of `joints`."""
+    """The state of one group of joints at one time. Every tuple is in the order of `joints`."""
 
     joints: tuple[str, ...]
     position_rad: tuple[Finite, ...]
@@ -119,7 +119,7 @@ class ServoState(Message):
     """Latched faults, each 'joint: what', e.g. 'elbow: overload'."""
     latch: LatchState = "unknown"
     stopped_by: str = ""
-    """Why the network ignores commands and holds still ('' when it obeys)."""
+    """Why the group ignores commands and holds still ('' when it obeys)."""
 
     def __post_init__(self) -> None:
         for name in ("position_rad", "speed_radps", "load"):
@@ -128,9 +128,9 @@ class ServoState(Message):
 
 
 class ServoCommand(Message):
-    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for the
-    network's `command_timeout_s`. Then an arm or neck joint that still moves holds its position; the hand keeps its
-    goal, so that it does not drop an object."""
+    """Goals for the named joints of one group; the other joints keep their goals. A command is valid for the
+    `command_timeout_s` of the group's line. Then an arm or neck joint that still moves holds its position; the hand
+    keeps its goal, so that it does not drop an object."""
 
     joints: tuple[str, ...]
     goal_rad: tuple[Finite, ...]
@@ -159,7 +159,7 @@ class ServoRequest(msgspec.Struct, kw_only=True):
 
     action: Literal["clear", "relax", "hold"]
     joints: tuple[str, ...] = ()
-    """Joints of the called network; empty means all of them."""
+    """Joints of the called group; empty means all of them."""
 
 
 class ServoReply(msgspec.Struct, kw_only=True):

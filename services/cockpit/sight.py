@@ -75,7 +75,7 @@ class Sight:
         self._body = History(3, angular=(2,))
 
     def take_joints(self, arm: ServoState) -> None:
-        """Take the head's angles out of a servo network's state."""
+        """Take the head's angles out of a servo group's state."""
         angles = dict(zip(arm.joints, arm.position_rad, strict=True))
         if all(joint in angles for joint in self._chain.joints):
             self._head.add(arm.stamp_ns, [angles[joint] for joint in self._chain.joints], arm.incarnation)
