@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from one_line import CALLIOPE, LINE, WHEELS, its, one_line, one_line_data
 from world_operator import EMPTY
 
-from apps.cli.servos import _groups_of
+from apps.cli.servos import ServoWorkbench, _groups_of
 from cocoro import topics
 from cocoro.errors import ConfigError
 from cocoro.joints import GROUPS
@@ -17,7 +18,9 @@ from cocoro.messages import EstopRequest, Latch, ServoCommand, ServoState
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS
 from cocoro.testing import ServiceUnderTest, in_virtual_time
+from deploy import profiles
 from services.servos.service import ServosConfig
+from services.servos.tools import FoundServo
 from sim.wire.firmware import firmware
 from sim.wire.models import servos_on_lines
 from sim.wire.service import WireMotors, setup_of
@@ -25,6 +28,7 @@ from sim.world import World
 
 ROBOT = one_line()
 ELBOW, CLAW = its("elbow"), its("claw_left")
+NUMBER_OF_CLAW = ROBOT.joints[CLAW].id
 COUNT_RAD = UNITS["feetech"].count_rad
 
 
@@ -133,7 +137,7 @@ def test_a_line_called_as_what_stands_beside_its_port_is_not_emulated() -> None:
 
 def test_a_lines_port_is_found_by_its_name() -> None:
     assert ServosConfig().port_of(LINE) == "/dev/cocoro-bus"
-    assert ServosConfig(port="wire:{line}").port_of(LINE) == "wire:bus"
+    assert profiles.read("sim-wire").config("servos", ServosConfig).port_of(LINE) == "wire:bus"
     assert ServosConfig(port="wire:{line}", ports={LINE: "/dev/ttyACM0"}).port_of(LINE) == "/dev/ttyACM0"
 
 
@@ -159,6 +163,22 @@ def test_requests_go_to_the_groups_of_the_joints() -> None:
     assert _groups_of([CLAW, ELBOW], ROBOT) == {"arm": [ELBOW], "hand": [CLAW]}
     with pytest.raises(ConfigError, match=f"{WHEELS[0]} is no joint of arm or hand"):
         _groups_of([WHEELS[0]], ROBOT)
+
+
+def test_of_two_joints_with_one_id_a_found_servo_is_that_of_the_line_at_its_port() -> None:
+    data = one_line_data()
+    data["network"]["base"] = data["network"][LINE]
+    joint(data, WHEELS[0]).update(network="base", id=joint(data, ELBOW)["id"])
+    ports = {LINE: "/dev/one", "base": "/dev/other"}
+    bench = ServoWorkbench(profiles.read("robot"), Robot.from_data(data), ports, Path("measured.toml"))
+
+    def owner(port: str, number: int) -> str | None:
+        one = bench.owner(FoundServo(port, 1_000_000, number, "feetech", "STS3215", 0, 2048, 12.0, 30, (), False))
+        return one.name if one is not None else None
+
+    assert [owner(port, 5) for port in (*ports.values(), "/dev/third")] == [ELBOW, WHEELS[0], None]
+    assert owner("/dev/third", NUMBER_OF_CLAW) == CLAW
+    assert owner("/dev/one", 99) is None
 
 
 # --- the simulator --------------------------------------------------------------------------------

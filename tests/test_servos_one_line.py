@@ -83,6 +83,8 @@ def test_a_servo_that_is_silent_is_a_fault_of_its_own_group(bench: ServoBench) -
 def test_the_doctor_looks_at_every_servo_of_the_line_and_lets_wheels_be_wheels(bench: ServoBench) -> None:
     config = ServosConfig(ports={LINE: bench.port(LINE)}, reply_s=0.2)
     assert {one.state for one in check(config, bench.robot, "robbie")} == {"ok"}
+    wrong = ServosConfig(ports={**config.ports, "arm": "/dev/null"}, reply_s=0.2)
+    assert [one.name for one in check(wrong, bench.robot, "robbie") if one.state == "bad"] == ["servo settings"]
     bench.put(NUMBER[ELBOW], **WHEEL["feetech"])
     bench.call(lambda: setattr(bench.servo(NUMBER[WHEELS[0]]), "mute", True))
     bad = {one.name for one in check(config, bench.robot, "robbie") if one.state == "bad"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import select
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +40,7 @@ from deploy.profiles import Profile
 from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.families import FAMILIES
+from services.servos.tools import FoundServo
 
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
 NOBODY = "this command waits for a person at a terminal, but standard input has ended"
@@ -187,6 +188,14 @@ class ServoWorkbench:
             raise ConfigError(f"there is no joint {name!r}; {choice_of(name, self.robot.joints)}")
         return self.robot.joints[name]
 
+    def owner(self, found: FoundServo) -> Joint | None:
+        """The joint whose servo was found: the only one with its ID, or of several the one whose line has its port."""
+        alike = [joint for joint in self.robot.joints.values() if joint.id == found.number]
+        if len(alike) > 1:
+            place = Path(found.port).resolve()
+            alike = [joint for joint in alike if Path(self.ports[joint.network]).resolve() == place]
+        return alike[0] if len(alike) == 1 else None
+
     @contextmanager
     def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
         """Opens the serial line that the joint's servo is on."""
@@ -237,23 +246,24 @@ def scan_ports(
         print(text, file=sys.stderr)
 
     found = list(tools.scan(wanted, bauds or tools.BAUDS, range(1, last + 1), report))
-    names = {joint.id: joint for joint in bench.robot.joints.values()}
+    owners = {one: joint for one in found if (joint := bench.owner(one)) is not None}
     if as_json:
         print_json([one._asdict() for one in found])
     else:
-        _print_found(found, names)
-    missing = [joint for number, joint in names.items() if number not in {one.number for one in found}]
+        _print_found(found, owners)
+    there = {joint.name for joint in owners.values()}
+    missing = [joint for joint in bench.robot.joints.values() if joint.name not in there]
     if missing and not as_json:
         print(f"not found: {', '.join(f'{joint.name} (ID {joint.id})' for joint in missing)}")
     if write is not None:
-        _write_ports(bench, found, names, write)
+        _write_ports(bench, owners, write)
     return exits.FAILED if missing else exits.DONE
 
 
-def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
+def _print_found(found: list[FoundServo], owners: Mapping[FoundServo, Joint]) -> None:
     rows = []
     for one in found:
-        joint = names[one.number].name if one.number in names else "?"
+        joint = owners[one].name if one in owners else "?"
         errors = ", ".join(one.errors)
         delay = f"{one.return_delay_us} us" if one.return_delay_us else ""
         rows.append(
@@ -264,11 +274,10 @@ def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
     print_table(heads, rows) if rows else print("no servo answers")
 
 
-def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint], file: Path) -> None:
+def _write_ports(bench: ServoWorkbench, owners: Mapping[FoundServo, Joint], file: Path) -> None:
     """Writes each line's port into a profile, and what differs of baud rate and protocol into the measured file."""
     for line, row in bench.robot.networks.items():
-        own = [one for one in found if one.number in names and names[one.number].network == line]
-        places = {(one.port, one.baud, one.protocol) for one in own}
+        places = {(one.port, one.baud, one.protocol) for one, joint in owners.items() if joint.network == line}
         if not places:
             continue
         if len(places) > 1:

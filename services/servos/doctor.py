@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from cocoro.checks import Check, bad, note, ok
+from cocoro.errors import ConfigError
 from cocoro.joints import Joint
 from cocoro.ports import check_port, port_path
 from cocoro.robot import Robot
@@ -18,6 +19,10 @@ __all__ = ["check"]
 
 def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
     checks: list[Check] = []
+    try:
+        config.check(robot)
+    except ConfigError as error:
+        checks.append(bad("servo settings", str(error)))
     for name, row in robot.networks.items():
         port = config.port_of(name)
         checked = check_port(name, port, robot_name, quick=True)
