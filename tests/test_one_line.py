@@ -150,6 +150,7 @@ def test_the_former_names_of_the_ports_still_count() -> None:
     ("config", "says"),
     [
         (ServosConfig(ports={"buss": "/dev/ttyACM0"}), "ports: the robot has no line 'buss'; known are bus; did you"),
+        (ServosConfig(arm_port="/dev/ttyACM0"), "ports: the robot has no line 'arm'; known are bus"),
         (ServosConfig(torque={"claw": 0.4}), "torque: the robot has no joint 'claw'; known are"),
     ],
 )

@@ -171,7 +171,7 @@ def angle(state: ServoState, joint: str) -> float:
 
 @asynccontextmanager
 async def inspected(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
-    """The servo service on both lines, all servos read, the emergency stop released."""
+    """The servo service on all lines, all servos read, the emergency stop released."""
     settings = {"ports": {line: bench.port(line) for line in bench.robot.networks}, "reply_s": REPLY_S} | config
     async with ServiceUnderTest("services.servos.service", settings, robot=bench.robot, clock=RealClock()) as service:
         servos = Moved(bench, service)

@@ -51,12 +51,17 @@ class ServosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def port_of(self, line: str) -> str:
         """The port of a line, as the settings name it."""
-        former = {"arm": self.arm_port, "hand": self.hand_port}.get(line, "")
-        return self.ports.get(line) or former or self.port.replace("{line}", line)
+        return self._named.get(line) or self.port.replace("{line}", line)
+
+    @property
+    def _named(self) -> dict[str, str]:
+        """The ports that are set for one line."""
+        former = {"arm": self.arm_port, "hand": self.hand_port}
+        return {line: port for line, port in former.items() if port} | self.ports
 
     def check(self, robot: Robot) -> None:
         """Raises ConfigError for a line or a joint that the robot does not have."""
-        named = ("ports", "line", self.ports, robot.networks), ("torque", "joint", self.torque, robot.joints)
+        named = ("ports", "line", self._named, robot.networks), ("torque", "joint", self.torque, robot.joints)
         for setting, kind, names, known in named:
             if unknown := sorted(set(names) - set(known)):
                 choice = choice_of(unknown[0], known)
