@@ -83,7 +83,7 @@ class FetchLimits:
         out = parked | robot.poses["unfolded"] | {roll: robot.claw.level_roll_rad}
         behind, around, up = (self._joints(pose) for pose in (grasp.behind, grasp.around, lifted))
         # The wheel on the outer side drives the way and its share of the turn.
-        outer_m = abs(offset.ahead_m) + abs(offset.heading_rad) * base.wheel_separation_m / 2
+        outer_m = abs(offset.ahead_m) + abs(offset.heading_rad) * robot.drive.lever_m
         drive_s = ramp_s(outer_m, base.max_wheel_speed_mps, base.wheel_acceleration_mps2)
         unfold_s = self._servos_s(parked, out) + self._servos_s(out, behind)
         beside_rad = max(abs(atan2(place_m[1], place_m[0])) - kinect.horizontal_fov_rad / 2, 0.0)

@@ -16,7 +16,6 @@ import time
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import RealClock
-from cocoro.differential import command_of
 from cocoro.errors import CocoroError
 from cocoro.messages import BaseState, Health, Latch, RecoverRequest, ServoCommand, ServoRequest
 from cocoro.node import Node
@@ -56,7 +55,7 @@ class Driver:
             step = int(time.monotonic() / STEP_S)
             left_mps, right_mps = WHEELS[step % len(WHEELS)]
             node.publish(topics.LATCH, Latch(state="released"))
-            node.publish(topics.BASE_COMMAND, command_of(node.robot.base, left_mps, right_mps))
+            node.publish(topics.BASE_COMMAND, node.robot.drive.command_of((left_mps, right_mps)))
             sign = 1.0 if step % 2 else -1.0
             for topic, joints in ((topics.ARM_COMMAND, ("elbow", "shoulder")), (topics.HAND_COMMAND, ("claw_left",))):
                 goals = tuple(sign * REACH_RAD[joint] for joint in joints)

@@ -15,7 +15,6 @@ from pathlib import Path
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
-from cocoro.differential import command_of
 from cocoro.errors import CocoroError
 from cocoro.messages import BaseState, ResetRequest
 from cocoro.node import Node
@@ -80,7 +79,7 @@ class Driver:
 
     async def _drive(self) -> None:
         async for _ in self.node.every(50.0):
-            self.node.publish(topics.BASE_COMMAND, command_of(self.node.robot.base, *CIRCLE))
+            self.node.publish(topics.BASE_COMMAND, self.node.robot.drive.command_of(CIRCLE))
 
     async def until(self, good: Callable[[BaseState], object]) -> BaseState:
         async with asyncio.timeout(PATIENCE_S):

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from cocoro.base import Base
 from cocoro.errors import ConfigError
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
 from cocoro.units import Positive, Vec3
@@ -23,35 +24,6 @@ _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name need
 
 LensValues = tuple[float, float, float, float, float, float, float, float, float]
 """fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
-
-
-class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    wheel_separation_m: Positive
-    wheel_radius_m: Positive
-    chassis_diameter_m: Positive
-    chassis_height_m: Positive
-    mass_kg: Positive
-    max_wheel_speed_mps: Positive
-    wheel_acceleration_mps2: Positive
-    command_timeout_s: Positive
-    """A wheel command is valid for at most this time, at any speed."""
-    state_rate_hz: Positive
-    stand_within_s: Positive = 0.3
-    """The wheels stand within this time after the last command, from any speed."""
-    stand_reserve_s: Positive = 0.03
-    """The part of `stand_within_s` reserved for the delivery of a command, one period of the loop that notices the
-    silence, and the body's lag behind the ramp of its wheels."""
-
-    def patience_s(self, speed_mps: float) -> float:
-        """The age up to which a command counts when it turns the faster wheel at this speed; the ramp down to standing
-        takes the rest of `stand_within_s`."""
-        ramp_s = abs(speed_mps) / self.wheel_acceleration_mps2
-        return max(min(self.command_timeout_s, self.stand_within_s - self.stand_reserve_s - ramp_s), 0.0)
-
-    def speed_at_age_mps(self, age_s: float) -> float:
-        """The highest wheel speed from which the base still stands in time when the last command has this age."""
-        ramp_s = self.stand_within_s - self.stand_reserve_s - age_s
-        return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
 
 
 class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

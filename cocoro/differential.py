@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from cocoro.description import Base
-from cocoro.messages import BaseCommand
+from collections.abc import Sequence
+
+from cocoro.drive import Twist, WheelDrive
 
 
-def wheels_of(base: Base, command: BaseCommand) -> tuple[float, float]:
-    """Speeds of the left and the right wheel, m/s, that move the body as commanded.
+class Differential(WheelDrive):
+    """Two wheels, `separation_m` apart."""
 
-    Raises ValueError for a command to move aside, which such a base cannot do.
-    """
-    if command.aside_mps:
-        raise ValueError(f"a base with two wheels cannot move aside, as commanded with {command.aside_mps:+.3f} m/s")
-    half_mps = command.turn_radps * base.wheel_separation_m / 2
-    return command.ahead_mps - half_mps, command.ahead_mps + half_mps
+    names = ("left", "right")
+    goes_aside = False
+    in_step = False  # as a Create: it ramps each wheel by itself
 
+    def __init__(self, separation_m: float) -> None:
+        self.separation_m = separation_m
+        self.lever_m = separation_m / 2
 
-def command_of(base: Base, left_mps: float, right_mps: float, stamp_ns: int = 0) -> BaseCommand:
-    """The command that turns the wheels at these speeds."""
-    turn_radps = (right_mps - left_mps) / base.wheel_separation_m
-    return BaseCommand(ahead_mps=(left_mps + right_mps) / 2, turn_radps=turn_radps, stamp_ns=stamp_ns)
+    def wheels(self, twist: Twist) -> tuple[float, float]:
+        """Left and right. Raises ValueError for a motion aside, which such a base cannot make."""
+        if twist.aside:
+            raise ValueError(f"a base with two wheels cannot move aside, as commanded with {twist.aside:+.3f} m/s")
+        half = twist.turn * self.separation_m / 2
+        return twist.ahead - half, twist.ahead + half
 
-
-def faster_mps(base: Base, command: BaseCommand) -> float:
-    """Speed of the faster wheel, m/s, without its sign."""
-    return max(abs(speed_mps) for speed_mps in wheels_of(base, command))
+    def twist(self, wheels: Sequence[float]) -> Twist:
+        left, right = wheels
+        return Twist((left + right) / 2, (right - left) / self.separation_m)

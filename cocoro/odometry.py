@@ -1,4 +1,4 @@
-"""Odometry of a Create: integrated wheel commands, corrected by its coarse reports.
+"""Odometry: the body's pose by what its wheels have rolled.
 
 A Create reports its path in whole millimetres and its turn in whole degrees since the last request, and drops the rest
 (iRobot Create Open Interface, packets 19 and 20). Requested often, a slow arc reads as straight ahead; requested
@@ -9,9 +9,11 @@ known from other drivers of this base).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import cos, sin
 
-from cocoro.description import Base
+from cocoro.base import Base
+from cocoro.drive import WheelDrive
 
 REPORT_PERIOD_S = 0.2
 """Period of requests for path and turn: at 5 Hz the unit of a report is small against its value."""
@@ -20,30 +22,53 @@ DEGREE_RAD = 0.017453292519943295
 
 
 class WheelRamp:
-    """Wheel speeds that follow the commanded ones: clipped, with limited acceleration."""
+    """Wheel speeds that follow the commanded ones: clipped, with limited acceleration.
+
+    The wheels of a drive `in_step` are clipped and accelerated by a common share: the body's motion goes straight from
+    what it is to what is commanded, and more than three wheels do not work against each other. Others go each by
+    itself, as a Create's.
+    """
 
     def __init__(self, base: Base) -> None:
+        drive = base.drive
         self._limit_mps = base.max_wheel_speed_mps
         self._acceleration_mps2 = base.wheel_acceleration_mps2
-        self.left_mps = 0.0
-        self.right_mps = 0.0
+        self._in_step = drive.in_step
+        self.wheels_mps: tuple[float, ...] = (0.0,) * len(drive.names)
 
-    def advance(self, left_mps: float, right_mps: float, dt_s: float) -> None:
+    @property
+    def fastest_mps(self) -> float:
+        """Speed of the fastest wheel, without its sign."""
+        return max(abs(speed_mps) for speed_mps in self.wheels_mps)
+
+    def advance(self, wheels_mps: Sequence[float], dt_s: float) -> None:
         """One time step towards the commanded speeds."""
-        reach = self._acceleration_mps2 * dt_s
-        self.left_mps += _clip(_clip(left_mps, self._limit_mps) - self.left_mps, reach)
-        self.right_mps += _clip(_clip(right_mps, self._limit_mps) - self.right_mps, reach)
+        reach, limit = self._acceleration_mps2 * dt_s, self._limit_mps
+        if not self._in_step:
+            self.wheels_mps = tuple(
+                now + _clip(_clip(wanted, limit) - now, reach)
+                for now, wanted in zip(self.wheels_mps, wheels_mps, strict=True)
+            )
+            return
+        wanted_mps = _scaled(wheels_mps, limit)
+        missing = [to - now for now, to in zip(self.wheels_mps, wanted_mps, strict=True)]
+        steps = _scaled(missing, reach)
+        arrives = max(abs(step) for step in missing) <= reach
+        self.wheels_mps = (
+            wanted_mps if arrives else tuple(now + step for now, step in zip(self.wheels_mps, steps, strict=True))
+        )
 
 
 class Odometry:
     """The body's pose in the frame in which it started, and its speeds."""
 
-    def __init__(self, base: Base) -> None:
-        self._separation_m = base.wheel_separation_m
+    def __init__(self, drive: WheelDrive) -> None:
+        self._drive = drive
         self.x_m = 0.0
         self.y_m = 0.0
         self.yaw_rad = 0.0
         self.speed_mps = 0.0
+        self.aside_mps = 0.0
         self.turn_rate_radps = 0.0
         self._way_m = 0.0
         self._turn_rad = 0.0
@@ -51,19 +76,24 @@ class Odometry:
         self._report_y_m = 0.0
         self._report_yaw_rad = 0.0
 
-    def advance(self, left_m: float, right_m: float, dt_s: float) -> None:
-        """Advance the pose by the arc that the wheels' travel in `dt_s` gives."""
-        way_m = (left_m + right_m) / 2
-        turn_rad = (right_m - left_m) / self._separation_m
+    def advance(self, rolled_m: Sequence[float], dt_s: float) -> None:
+        """Advance the pose by the wheels' travel in `dt_s`, during which the body's motion is taken as constant: each
+        point of it goes along an arc."""
+        way_m, turn_rad, aside_m = self._drive.twist(rolled_m)
         heading = self.yaw_rad + turn_rad / 2
-        chord_m = way_m * _chord_per_arc(turn_rad)
-        self.x_m += chord_m * cos(heading)
-        self.y_m += chord_m * sin(heading)
+        per_arc = _chord_per_arc(turn_rad)
+        chord_m, across_m = way_m * per_arc, aside_m * per_arc
+        c, s = cos(heading), sin(heading)
+        self.x_m += chord_m * c - across_m * s
+        self.y_m += chord_m * s + across_m * c
         self.yaw_rad += turn_rad
         self._way_m += way_m
         self._turn_rad += turn_rad
         self.speed_mps = way_m / dt_s
+        self.aside_mps = aside_m / dt_s
         self.turn_rate_radps = turn_rad / dt_s
+
+    # --- a Create's reports -------------------------------------------------------------------------
 
     def unreported(self) -> None:
         """Accept the integral since the last report, because the Create's report was lost."""
@@ -110,3 +140,9 @@ def _chord_per_arc(turn_rad: float) -> float:
 
 def _clip(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
+
+
+def _scaled(values: Sequence[float], limit: float) -> tuple[float, ...]:
+    """All values by one share, so that none exceeds the limit."""
+    most = max(abs(value) for value in values)
+    return tuple(values) if most <= limit else tuple(limit / most * value for value in values)

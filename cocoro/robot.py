@@ -52,6 +52,7 @@ class Robot:
         self._spec = spec
         self.name = spec.name
         self.base = spec.base
+        self.drive = spec.base.drive
         self.kinect = spec.kinect
         self.head = spec.head
         self.arm = spec.arm

@@ -5,11 +5,12 @@ Pure. The world passes in the time and what the wheels and the bumper did, and a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees
 
-from cocoro.description import Base
-from cocoro.differential import wheels_of
+from cocoro.base import Base
+from cocoro.drive import Twist, WheelDrive
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import REPORT_PERIOD_S, Odometry, WheelRamp
@@ -19,15 +20,16 @@ class CreateCounters:
     """Distance and angle since the last reading, in whole millimetres and degrees; the remainder is lost, as on a
     Create."""
 
-    def __init__(self, separation_m: float) -> None:
-        self._separation_m = separation_m
+    def __init__(self, drive: WheelDrive) -> None:
+        self._drive = drive
         self._distance_m = 0.0
         self._turn_rad = 0.0
 
-    def roll(self, left_m: float, right_m: float) -> None:
+    def roll(self, rolled_m: Sequence[float]) -> None:
         """Add what the wheel encoders measured."""
-        self._distance_m += (left_m + right_m) / 2
-        self._turn_rad += (right_m - left_m) / self._separation_m
+        ahead_m, turn_rad, _ = self._drive.twist(rolled_m)
+        self._distance_m += ahead_m
+        self._turn_rad += turn_rad
 
     def take(self) -> tuple[int, int]:
         """Distance in mm and angle in degrees, rounded towards zero. Resets both counters."""
@@ -47,20 +49,23 @@ class Bumper:
 
 
 class MobileBase:
-    """The base service and its Create: deadman, emergency stop, bump reflex, ramp and odometry.
+    """The base service and its wheels: deadman, emergency stop, bump reflex, ramp and odometry.
 
     With `exact` the odometry comes from perfect encoders, otherwise from the Create's reports, as in a real driver.
+    Omni wheels always have encoders of their own: the odometry of such a base is wrong only by how its wheels differ
+    and slip.
     """
 
     def __init__(self, base: Base, *, exact: bool) -> None:
+        self._drive = base.drive
         self.ramp = WheelRamp(base)
-        self.odometry = Odometry(base)
+        self.odometry = Odometry(self._drive)
         self.latch: LatchState = "released"
         self.bumper = Bumper()
         self._base = base
-        self._exact = exact
-        self._counters = CreateCounters(base.wheel_separation_m)
-        self._wanted = (0.0, 0.0)
+        self._exact = exact or base.kind != "differential"
+        self._counters = CreateCounters(self._drive)
+        self._rest = self._wanted = self.ramp.wheels_mps
         self._valid_until_ns = -1
         self._next_report_ns = 0
         self.stopped_by = ""
@@ -72,15 +77,15 @@ class MobileBase:
         if self.latch != "released":
             return STOPPED_BY[self.latch]
         try:
-            self._wanted = wheels_of(self._base, command)
+            self._wanted = self._drive.wheels_of(command)
         except ValueError as error:
             return str(error)
         sent_ns = min(command.stamp_ns or now_ns, now_ns)
-        self._valid_until_ns = sent_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
+        self._valid_until_ns = sent_ns + round(self._base.patience_s(self._fastest_mps()) * 1e9)
         return ""
 
-    def _faster_mps(self) -> float:
-        """Commanded speed of the faster wheel."""
+    def _fastest_mps(self) -> float:
+        """Commanded speed of the fastest wheel."""
         return min(max(abs(speed) for speed in self._wanted), self._base.max_wheel_speed_mps)
 
     def set_latch(self, state: LatchState) -> None:
@@ -88,19 +93,18 @@ class MobileBase:
         self.latch = state
         self._valid_until_ns = -1
 
-    def wheels(self, now_ns: int, dt_s: float) -> tuple[float, float]:
-        """Advance the ramp by one step. Returns the speeds to drive the left and the right wheel at, m/s."""
-        left, right = self._allowed_mps(now_ns)
-        self.ramp.advance(left, right, dt_s)
-        return self.ramp.left_mps, self.ramp.right_mps
+    def wheels(self, now_ns: int, dt_s: float) -> tuple[float, ...]:
+        """Advance the ramp by one step. Returns the speeds to drive the wheels at, m/s."""
+        self.ramp.advance(self._allowed_mps(now_ns), dt_s)
+        return self.ramp.wheels_mps
 
-    def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
-        """Take what the encoders measured in the step that ended now."""
+    def rolled(self, rolled_m: Sequence[float], now_ns: int, dt_s: float) -> None:
+        """Take what the wheels' encoders measured in the step that ended now."""
         if self._exact:
-            self.odometry.advance(left_m, right_m, dt_s)
+            self.odometry.advance(rolled_m, dt_s)
             return
-        self._counters.roll(left_m, right_m)
-        self.odometry.advance(self.ramp.left_mps * dt_s, self.ramp.right_mps * dt_s, dt_s)
+        self._counters.roll(rolled_m)
+        self.odometry.advance([speed_mps * dt_s for speed_mps in self.ramp.wheels_mps], dt_s)
         if now_ns >= self._next_report_ns:
             self._next_report_ns = now_ns + round(REPORT_PERIOD_S * 1e9)
             self.odometry.report(*self._counters.take())
@@ -113,25 +117,32 @@ class MobileBase:
             odometry_yaw_rad=odometry.yaw_rad,
             speed_mps=odometry.speed_mps,
             turn_rate_radps=odometry.turn_rate_radps,
+            aside_mps=odometry.aside_mps,
             bump_left=self.bumper.left,
             bump_right=self.bumper.right,
             latch=self.latch,
             stopped_by=self.stopped_by,
         )
 
-    def _allowed_mps(self, now_ns: int) -> tuple[float, float]:
-        """The part of the commanded speeds that deadman, emergency stop and bump reflex allow; left, right."""
+    def _allowed_mps(self, now_ns: int) -> tuple[float, ...]:
+        """The part of the commanded speeds that deadman, emergency stop and bump reflex allow."""
         self.stopped_by = ""
         if self.latch != "released":
             self.stopped_by = STOPPED_BY[self.latch]
-            return 0.0, 0.0
+            return self._rest
         if now_ns > self._valid_until_ns:
             self.stopped_by = "no command"
-            return 0.0, 0.0
-        left, right = self._wanted
-        if self.bumper.pressed and left + right > 0.0:
-            # A round base may still turn on the spot.
-            self.stopped_by = "bump"
-            forward = (left + right) / 2
-            return left - forward, right - forward
-        return left, right
+            return self._rest
+        if not self.bumper.pressed:
+            return self._wanted
+        # A round base may still turn on the spot, and leave what it touches.
+        ahead, _, aside = self._drive.twist(self._wanted)
+        into = Twist(max(ahead, 0.0), 0.0, aside if self._touches(aside) else 0.0)
+        if into == Twist():
+            return self._wanted
+        self.stopped_by = "bump"
+        return tuple(wanted - part for wanted, part in zip(self._wanted, self._drive.wheels(into), strict=True))
+
+    def _touches(self, aside: float) -> bool:
+        """Whether a switch is pressed on the side to which it is to move."""
+        return (self.bumper.left and aside > 0.0) or (self.bumper.right and aside < 0.0)

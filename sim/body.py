@@ -3,6 +3,13 @@
 Chassis, wheels, the mounting box, the marker and the claws' pads follow from the description's other tables; `solid`
 has the rest. The claws' pads are put at equal height: in the maker's drawing they are 32 mm apart, which would tip a
 can over.
+
+An omni wheel is one that touches the floor in one point, too, whose friction there acts along the direction in which it
+drives, and not along its axle: what is left of ideal rollers, which turn without resistance, when the motion of each is
+left out. Its force on the floor is the motor's, up to friction times load, and a wheel that the others push along its
+axle follows freely; so the body moves as the wheels' kinematics say, and slips or stands where they cannot hold it.
+Left out: the rollers' mass and drag, the jolt from roller to roller, and the change of the point of contact from one
+row of rollers to the other.
 """
 
 from __future__ import annotations
@@ -13,6 +20,7 @@ import msgspec
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.base import Base
 from cocoro.description import Part
 from cocoro.robot import Robot
 
@@ -20,7 +28,8 @@ CASTER_RADIUS_M = 0.010
 CASTER_X_M = 0.135
 CHASSIS, MOUNT = "chassis", "mount"
 """Names of links: the root, whose frame is the description's body frame, and the box that holds the Kinect up."""
-WHEELS, CASTERS = ("wheel_left", "wheel_right"), ("caster_front", "caster_rear")
+CASTERS = ("caster_front", "caster_rear")
+"""Links of a differential base; omni wheels carry the robot alone."""
 
 _WHITE = (0.82, 0.82, 0.80)
 _GREY = (0.45, 0.45, 0.46)
@@ -36,6 +45,8 @@ class Friction:
     lateral: float = 0.6
     spinning: float = 0.0
     rolling: float = 0.0
+    rollers: bool = False
+    """None of it acts along the link's y axis."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +56,8 @@ class Extra:
     name: str
     position_m: tuple[float, float, float]
     wheel: bool = False
+    turn_rad: float = 0.0
+    """About z: direction in which a wheel drives."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +66,8 @@ class SimBody:
 
     parts: dict[str, list[Part]]
     extras: list[Extra]
+    wheels: dict[str, float]
+    """Radius by link, m, in the order of the base's drive."""
     friction: dict[str, Friction] = field(default_factory=dict)
 
     @property
@@ -91,7 +106,6 @@ def body_of_parts(robot: Robot) -> SimBody:
     base, kinect = robot.base, robot.kinect
     low, high = np.array(kinect.mount_min_m), np.array(kinect.mount_max_m)
     mount_x, mount_y, mount_z = ((low + high) / 2).tolist()
-    wheel = base.wheel_radius_m
     mount = Part(MOUNT, MOUNT, "box", tuple((high - low).tolist()), rgb=_WHITE, mass_kg=robot.solid.mount_mass_kg)
     parts: dict[str, list[Part]] = {MOUNT: [mount]}
     extras = [Extra(MOUNT, (mount_x, mount_y, mount_z))]
@@ -100,7 +114,10 @@ def body_of_parts(robot: Robot) -> SimBody:
         if part.solid:
             extras.append(Extra(part.name, part.position_m))
             parts[part.name] = [msgspec.structs.replace(part, link=part.name, position_m=(0.0, 0.0, 0.0))]
-    parts |= {name: _wheel(name, wheel) for name in WHEELS} | {name: [_caster(name)] for name in CASTERS}
+    wheels, casters = _wheels(base), CASTERS if base.kind == "differential" else ()
+    radii = {wheel.name: wheel.position_m[2] for wheel in wheels}
+    parts |= {name: _wheel(name, radius_m) for name, radius_m in radii.items()}
+    parts |= {name: [_caster(name)] for name in casters}
     for part in robot.solid.part:
         if part.link != "body":
             parts.setdefault(part.link, []).append(part)
@@ -111,19 +128,33 @@ def body_of_parts(robot: Robot) -> SimBody:
     for jaw in robot.jaws:
         link = robot.link_of(jaw)
         parts.setdefault(link, []).extend(_jaw(robot, link))
-    left = base.wheel_separation_m / 2
     rest = base.mass_kg - sum(part.mass_kg for rows in parts.values() for part in rows)
     rest -= sum(part.mass_kg for part in inside)
     size = base.chassis_diameter_m / 2, base.chassis_height_m
     centre = 0.0, 0.0, CASTER_RADIUS_M + base.chassis_height_m / 2
     parts[CHASSIS] = [Part("chassis", CHASSIS, "cylinder", size, centre, _METAL, rest), *inside]
     extras += [
-        *(Extra(name, (0.0, y, wheel), wheel=True) for name, y in zip(WHEELS, (left, -left), strict=True)),
-        *(Extra(name, (x, 0.0, CASTER_RADIUS_M)) for name, x in zip(CASTERS, (CASTER_X_M, -CASTER_X_M), strict=True)),
+        *wheels,
+        *(Extra(name, (x, 0.0, CASTER_RADIUS_M)) for name, x in zip(casters, (CASTER_X_M, -CASTER_X_M), strict=False)),
     ]
-    friction = dict.fromkeys(WHEELS, Friction(1.0)) | dict.fromkeys(CASTERS, Friction(0.0))
+    friction = dict.fromkeys(radii, Friction(1.0, rollers=base.kind == "omni"))
+    friction |= dict.fromkeys(casters, Friction(0.0))
     friction |= {robot.link_of(jaw): Friction(0.9, spinning=0.01) for jaw in robot.jaws}
-    return SimBody(parts, extras, friction)
+    return SimBody(parts, extras, radii, friction)
+
+
+def _wheels(base: Base) -> list[Extra]:
+    """The wheels, each in a frame whose y axis is its axle and whose x axis is where it drives, in the order of the
+    base's drive."""
+    if base.kind == "omni":
+        return [
+            Extra(f"wheel_{wheel.name}", (*wheel.place_m, wheel.radius_m), wheel=True, turn_rad=wheel.drive_rad)
+            for wheel in base.wheel
+        ]
+    assert base.wheel_radius_m is not None
+    left_m = base.axle_m / 2
+    places = zip(base.drive.names, (left_m, -left_m), strict=True)
+    return [Extra(f"wheel_{name}", (0.0, y, base.wheel_radius_m), wheel=True) for name, y in places]
 
 
 def _caster(name: str) -> Part:

@@ -10,14 +10,13 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from sim.base import Bumper
-from sim.body import CASTERS, CHASSIS, WHEELS
+from sim.body import CHASSIS
 from sim.stage import FLOOR
 
 BUMPER_HALF_DEG = 90.0
 """The bumper covers the front half of the chassis."""
 BUMPER_OVERLAP_DEG = 20.0
 """A contact within this angle of straight ahead closes both switches."""
-ROLLS_ON_FLOOR = frozenset({*WHEELS, *CASTERS})
 
 ContactPair = tuple[str, str]
 
@@ -60,7 +59,11 @@ def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray
 
 
 def collisions(
-    pairs: Iterable[ContactPair], links: frozenset[str], claws: frozenset[str], objects: frozenset[str]
+    pairs: Iterable[ContactPair],
+    links: frozenset[str],
+    rolling: frozenset[str],
+    claws: frozenset[str],
+    objects: frozenset[str],
 ) -> tuple[str, ...]:
     """Unwanted contacts of the robot as 'link~other', sorted: all except wheels and casters on the floor, claws on an
     object, and the claws on each other."""
@@ -69,7 +72,7 @@ def collisions(
             f"{one}~{other}"
             for one, other in pairs
             if one in links
-            and not (one in ROLLS_ON_FLOOR and other == FLOOR)
+            and not (one in rolling and other == FLOOR)
             and not (one in claws and (other in objects or other in claws))
         )
     )

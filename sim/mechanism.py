@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import cos, sin
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
-from sim.body import CHASSIS, WHEELS
+from sim.body import CHASSIS
 from sim.bullet import Bullet
 from sim.model import RobotModel, write_urdf
 from sim.rigid import rotation, rotations
@@ -30,6 +30,8 @@ WHEEL_GAIN = 0.2
 """Share of a wheel's lag that one step corrects."""
 JOINT_GAIN = 0.1
 """Share of a joint's way to its goal that one step covers, within its speed limit; PyBullet's default."""
+ROLLERS = (1.0, 0.0, 1.0)
+"""Shares of the friction along a link's axes, for a link with rollers along y."""
 NO_LIMIT_RADPS = -1.0
 """PyBullet's value for a motor without a speed limit."""
 
@@ -64,9 +66,9 @@ class Mechanism:
         joint_of_link = {link.name: link.joint for link in robot.links.values() if link.joint}
         link_of_joint = {joint: link for link, joint in joint_of_link.items()}
         self._motors = {joint: self.index[link_of_joint[joint]] for joint in self.joints}
-        self._wheels = tuple(self.index[wheel] for wheel in WHEELS)
-        self._wheel_rad = [0.0, 0.0]
-        self._wheel_goal_rad = [0.0, 0.0]
+        self._wheels = tuple(self.index[wheel] for wheel in model.body.wheels)
+        self._wheel_rad = [0.0] * len(self._wheels)
+        self._wheel_goal_rad = [0.0] * len(self._wheels)
         self._read_indices = [*self._motors.values(), *self._wheels]
         # PyBullet gives the pose of the root's centre of mass.
         self._root_offset = np.array(bullet.getDynamicsInfo(self.body, -1)[3])
@@ -77,10 +79,10 @@ class Mechanism:
         target_rad, max_speed_radps, max_torque_nm = drive
         self._control(self._motors[joint], target_rad, 0.0, max_torque_nm, JOINT_GAIN, 1.0, max_speed_radps)
 
-    def spin(self, left_radps: float, right_radps: float, dt_s: float) -> None:
+    def spin(self, speeds_radps: Iterable[float], dt_s: float) -> None:
         """Turn the wheels at these speeds for the next step, as a controller with encoders does: the lag of one step is
         corrected in the next."""
-        for number, speed_radps in enumerate((left_radps, right_radps)):
+        for number, speed_radps in enumerate(speeds_radps):
             lag = self._wheel_goal_rad[number] - self._wheel_rad[number]
             lag = min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
             if speed_radps == 0.0 and abs(lag) > REST_LAG_RAD:
@@ -107,9 +109,9 @@ class Mechanism:
         )  # fmt: skip
 
     def read(self) -> list[JointReading]:
-        """Readings of the servo joints in the order of `joints`, then of the left and the right wheel."""
+        """Readings of the servo joints in the order of `joints`, then of the wheels in that of the base's drive."""
         states = self._bullet.getJointStates(self.body, self._read_indices)
-        self._wheel_rad = [state[0] for state in states[-2:]]
+        self._wheel_rad = [state[0] for state in states[len(self.joints) :]]
         return [(angle, speed, torque) for angle, speed, _, torque in states]
 
     def root(self) -> tuple[Vec3, Quaternion]:
@@ -148,6 +150,8 @@ class Mechanism:
                 rollingFriction=friction.rolling,
                 restitution=0.0,
             )
+            if friction.rollers:
+                bullet.changeDynamics(self.body, self.index[link], anisotropicFriction=ROLLERS)
         bullet.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0)
         pairs = {frozenset(pair) for pair in model.collision_pairs()}
         for one in model.links:

@@ -146,7 +146,7 @@ def _geometry_xml(part: Part) -> str:
 
 
 def _extra_joint(extra: Extra) -> str:
-    place = np.eye(4)
+    place = turn_z(extra.turn_rad) if extra.turn_rad else np.eye(4)
     place[:3, 3] = extra.position_m
     return _joint_xml(extra.name, CHASSIS, place, "continuous" if extra.wheel else "fixed", axis="0 1 0")
 

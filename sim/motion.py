@@ -32,7 +32,7 @@ class MotionRow(NamedTuple):
     rim_mps: float
     """Speed of a wheel's contact point about the body's centre, from how far the body turned in this step."""
     asked_mps: float
-    """Speed of the faster wheel by the base's ramp."""
+    """Speed of the fastest wheel by the base's ramp."""
     no_command: bool
     """Whether the base's deadman had stopped the wheels."""
 
@@ -51,7 +51,7 @@ class MotionWriter:
         except OSError as error:
             raise ConfigError(f"motion = {str(path)!r}: {error.strerror}; name a file that can be written") from error
         self._world = world
-        self._separation_m = world.robot.base.wheel_separation_m
+        self._lever_m = world.robot.drive.lever_m
         self._before = self._place()
         self._before_ns = world.time_ns
 
@@ -72,7 +72,7 @@ class MotionWriter:
         turned_rad = abs(wrap_rad(yaw - self._before[2]))
         wheels = world.wheels()
         row = (
-            world.time_ns, time.monotonic_ns(), moved_m / dt_s, turned_rad * self._separation_m / 2 / dt_s,
+            world.time_ns, time.monotonic_ns(), moved_m / dt_s, turned_rad * self._lever_m / dt_s,
             wheels.speed_mps, wheels.no_command,
         )  # fmt: skip
         self._file.write(_ROW.pack(*row))

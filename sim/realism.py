@@ -49,9 +49,9 @@ REALISM: dict[Sensors, BodyRealism] = {
 }
 
 
-def wheel_scales(seed: int, realism: BodyRealism) -> FloatArray:
-    """Distance that the left and the right wheel roll per nominal metre in the run `seed`, (2,)."""
-    return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error)
+def wheel_scales(seed: int, realism: BodyRealism, wheels: int) -> FloatArray:
+    """Distance that each wheel rolls per nominal metre in the run `seed`, (wheels,)."""
+    return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, wheels) * realism.wheel_scale_error)
 
 
 class Wander:
@@ -81,7 +81,7 @@ CAMERA_M, CAMERA_DEG = 0.005, 1.0
 MARKER_M = 0.005
 """Distance of the marker from its nominal place, in a random direction."""
 WHEELS_M = 0.008
-"""Largest error of the distance between the wheels."""
+"""Largest error of the distance between two wheels; half of it, of an omni wheel from the middle."""
 LOOSENING_DEG_PER_MIN = 0.03
 """Largest rate at which an arm joint slips on its servo's shaft, always in one direction."""
 BEND_RAD = 0.15
@@ -137,7 +137,10 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     data["link"].append(camera)
     marker = np.array(data["marker"]["position_m"]) + MARKER_M * _direction(rng)
     data["marker"]["position_m"] = tuple(marker.tolist())
-    data["base"]["wheel_separation_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M))
+    if robot.base.kind == "differential":
+        data["base"]["wheel_separation_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M))
+    for wheel in data["base"]["wheel"]:
+        wheel["distance_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M)) / 2
     return Robot.from_data(data, "worn body")
 
 

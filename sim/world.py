@@ -15,10 +15,11 @@ from cocoro.joints import GROUPS, KEEPS_GOAL, Group
 from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, ServoState, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
+from sim.body import CASTERS
 from sim.bullet import Bullet
 from sim.contacts import ContactPair, bumper, collisions, touching_pairs
 from sim.kinds import Sensors
-from sim.mechanism import Mechanism
+from sim.mechanism import JointReading, Mechanism
 from sim.model import build_model
 from sim.realism import REALISM, BodyRealism, Wander, Wear, wheel_scales
 from sim.render.interface import Visual
@@ -39,7 +40,7 @@ class WheelMotion(NamedTuple):
     """The base's present drive of its wheels."""
 
     speed_mps: float
-    """Speed of the faster wheel by the base's ramp."""
+    """Speed of the fastest wheel by the base's ramp."""
     no_command: bool
     """Whether the wheels are stopped because the last command has expired."""
 
@@ -114,8 +115,10 @@ class World:
         self._driven: list[Drive | None] = [None] * len(self._servos)
 
         sense_s = self._sense_every * self._dt_s
-        self._wheel_scale = wheel_scales(seed, realism)
-        self._slip = Wander(stream(seed, "wheel slip"), 2, realism.wheel_slip, realism.slip_time_s, sense_s)
+        self._radii_m = tuple(self._model.body.wheels.values())
+        wheels = len(self._radii_m)
+        self._wheel_scale = wheel_scales(seed, realism, wheels)
+        self._slip = Wander(stream(seed, "wheel slip"), wheels, realism.wheel_slip, realism.slip_time_s, sense_s)
         self._scatter = Wander(
             stream(seed, "servo speed"),
             len(self._servos),
@@ -124,10 +127,10 @@ class World:
             sense_s,
         )
         self._stretch = _floats(self._wheel_scale * (1.0 + self._slip.values))
-        """Distance that the left and the right wheel roll per nominal metre now."""
+        """Distance that each wheel rolls per nominal metre now."""
         self._speed_factors = _floats(1.0 + self._scatter.values)
         """Speed of each servo as a share of the commanded one."""
-        self._rolled_m = [0.0, 0.0]
+        self._rolled_m = [0.0] * wheels
         self._contacts: deque[frozenset[ContactPair]] = deque(maxlen=CONTACT_MEMORY)
         self._pressed = Bumper()
         self._place_visuals()
@@ -186,10 +189,11 @@ class World:
             self._speed_factors = _floats(1.0 + self._scatter.step())
             for joint, servo in zip(self._mechanism.joints, self._servos, strict=True):
                 servo.slip_rad = self._wear.slip_rad(joint, self._steps / self._hz)
-        stretch = self._stretch
-        radius_m = self.robot.base.wheel_radius_m
-        left_mps, right_mps = self._base.wheels(now_ns, dt_s)
-        self._mechanism.spin(left_mps * stretch[0] / radius_m, right_mps * stretch[1] / radius_m, dt_s)
+        stretch, radii_m = self._stretch, self._radii_m
+        wheels_mps = self._base.wheels(now_ns, dt_s)
+        self._mechanism.spin(
+            [mps * share / radius_m for mps, share, radius_m in zip(wheels_mps, stretch, radii_m, strict=True)], dt_s
+        )
         for group in self._groups.values():
             group.expire(now_ns)
         self._drive_servos()
@@ -202,11 +206,10 @@ class World:
         readings = self._mechanism.read()
         for servo, reading in zip(self._servos, readings, strict=False):
             servo.sense(*reading, now_ns)
-        rolled = [angle_rad * radius_m for angle_rad, _, _ in readings[-2:]]
+        before, self._rolled_m = self._rolled_m, self._rolled(readings)
         # The encoders count turns of the wheel, not the distance that it made with them.
-        left_m, right_m = (rolled[0] - self._rolled_m[0]) / stretch[0], (rolled[1] - self._rolled_m[1]) / stretch[1]
-        self._rolled_m = rolled
-        self._base.rolled(left_m, right_m, now_ns, dt_s)
+        counted_m = [(now - was) / share for now, was, share in zip(self._rolled_m, before, stretch, strict=True)]
+        self._base.rolled(counted_m, now_ns, dt_s)
 
     # --- truth, and what the renderer draws ---------------------------------------------------------
 
@@ -241,6 +244,7 @@ class World:
             collisions=collisions(
                 pairs,
                 frozenset(self._model.links),
+                frozenset({*self._model.body.wheels, *CASTERS}),
                 self._jaws,
                 frozenset(self._stage.labels[: self._stage.object_count]),
             ),
@@ -252,8 +256,7 @@ class World:
 
     def wheels(self) -> WheelMotion:
         """The present drive of the wheels, independent of what the base reports."""
-        ramp = self._base.ramp
-        return WheelMotion(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
+        return WheelMotion(self._base.ramp.fastest_mps, self._base.stopped_by == "no command")
 
     @property
     def light(self) -> Light:
@@ -303,15 +306,20 @@ class World:
 
     def _settle(self) -> None:
         """Let everything come to rest on the floor before simulated time begins."""
-        self._mechanism.spin(0.0, 0.0, self._dt_s)
+        self._mechanism.spin([0.0] * len(self._radii_m), self._dt_s)
         self._drive_servos()
         for _ in range(round(SETTLE_S * self._hz)):
             self._bullet.stepSimulation()
         readings = self._mechanism.read()
         for servo, reading in zip(self._servos, readings, strict=False):
             servo.sense(*reading, 0)
-        self._rolled_m = [angle_rad * self.robot.base.wheel_radius_m for angle_rad, _, _ in readings[-2:]]
+        self._rolled_m = self._rolled(readings)
         self._read_contacts()
+
+    def _rolled(self, readings: Sequence[JointReading]) -> list[float]:
+        """Way that each wheel's rim has gone, m."""
+        wheels = readings[len(self._servos) :]
+        return [angle_rad * radius_m for (angle_rad, _, _), radius_m in zip(wheels, self._radii_m, strict=True)]
 
     def _angles(self) -> list[float]:
         return [servo.angle_rad for servo in self._servos]
@@ -331,7 +339,8 @@ class World:
         )
         self._contacts.append(pairs)
         before = self._pressed
-        pressed = bumper(on_chassis, self._mechanism.root_pose()) if on_chassis else Bumper()
+        felt = on_chassis and self.robot.base.bumper
+        pressed = bumper(on_chassis, self._mechanism.root_pose()) if felt else Bumper()
         self._base.bumper = Bumper(pressed.left or before.left, pressed.right or before.right)
         self._pressed = pressed
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from cocoro.clock import NS
-from cocoro.differential import command_of
 from cocoro.messages import BaseCommand
 from cocoro.odometry import WheelRamp
 from cocoro.robot import Robot
@@ -25,7 +24,7 @@ def released() -> BaseDriver:
 
 
 def command(wheels: tuple[float, float]) -> BaseCommand:
-    return command_of(BASE, *wheels, SAID_NS)
+    return BASE.drive.command_of(wheels, SAID_NS)
 
 
 @pytest.mark.parametrize("wheels", SPEEDS)
@@ -61,11 +60,11 @@ def test_a_word_that_was_long_on_its_way_counts_from_when_it_was_said() -> None:
 def test_the_simulators_wheels_stand_in_time_after_the_last_word(wheels: tuple[float, float], late_s: float) -> None:
     base = MobileBase(BASE, exact=True)
     base.ramp = WheelRamp(BASE)
-    base.ramp.advance(*wheels, 10.0)
-    assert max(abs(base.ramp.left_mps), abs(base.ramp.right_mps)) > 0.04
+    base.ramp.advance(wheels, 10.0)
+    assert base.ramp.fastest_mps > 0.04
     base.command(command(wheels), SAID_NS + round(late_s * NS))
     steps = 0
-    while steps == 0 or base.ramp.left_mps or base.ramp.right_mps:
+    while steps == 0 or any(base.ramp.wheels_mps):
         steps += 1
         base.wheels(SAID_NS + round(steps * STEP_S * NS), STEP_S)
     assert base.stopped_by == "no command"

@@ -18,7 +18,6 @@ from wire_base import DEADMAN_NS, MS, PATIENCE_NS, Bench
 
 from cocoro import topics
 from cocoro.clock import RealClock
-from cocoro.differential import command_of
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseConfig, BaseService
@@ -67,7 +66,7 @@ class Driven:
     async def _drive(self, left_mps: float, right_mps: float) -> None:
         async for _ in self.service.tester.every(50.0):
             self.commanded_ns = time.monotonic_ns()
-            self.service.feed(topics.BASE_COMMAND, command_of(self.service.robot.base, left_mps, right_mps))
+            self.service.feed(topics.BASE_COMMAND, self.service.robot.drive.command_of((left_mps, right_mps)))
 
     async def wheels(self, left: int, right: int) -> int:
         return await asyncio.to_thread(self.bench.until_wheels, left, right)

@@ -17,7 +17,6 @@ from apps.captures.rewrite import info_in
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
-from cocoro.differential import wheels_of
 from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
 from services.capture.keys import QueuedMessage
@@ -33,7 +32,7 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
 
     def older(name: str, payload: bytes) -> bytes:
         if name == "BaseCommand":
-            left_mps, right_mps = wheels_of(base, msgspec.msgpack.decode(payload, type=BaseCommand))
+            left_mps, right_mps = base.drive.wheels_of(msgspec.msgpack.decode(payload, type=BaseCommand))
             command = {**msgspec.msgpack.decode(payload), "left_mps": left_mps, "right_mps": right_mps}
             for field in ("ahead_mps", "turn_radps", "aside_mps"):
                 command.pop(field, None)
@@ -95,6 +94,7 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: model is new: gets its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: gets its default",
         "calliope/executive/intent: Intent has changed: its former shape is converted",
+        "calliope/base/state: aside_mps is new: gets its default",
         "calliope/base/command: BaseCommand has changed: its former shape is converted",
     }
     assert any("changed since, calliope/planning/status: model is new" in line for line in describe_result(result))

@@ -20,15 +20,15 @@ def drive_by_reports(
     left_mps: float, right_mps: float, seconds: float, *, share: float = 1.0, report_hz: int = 5
 ) -> tuple[Odometry, Odometry]:
     """Fused and exact odometry of wheels that turn at `share` of the commanded speed."""
-    fused, exact = Odometry(ROBOT.base), Odometry(ROBOT.base)
-    counters = CreateCounters(ROBOT.base.wheel_separation_m)
+    fused, exact = Odometry(ROBOT.drive), Odometry(ROBOT.drive)
+    counters = CreateCounters(ROBOT.drive)
     ramp = WheelRamp(ROBOT.base)
     for step in range(1, round(seconds * HZ) + 1):
-        ramp.advance(left_mps, right_mps, 1 / HZ)
-        fused.advance(ramp.left_mps / HZ, ramp.right_mps / HZ, 1 / HZ)
-        left_m, right_m = share * ramp.left_mps / HZ, share * ramp.right_mps / HZ
-        exact.advance(left_m, right_m, 1 / HZ)
-        counters.roll(left_m, right_m)
+        ramp.advance((left_mps, right_mps), 1 / HZ)
+        fused.advance([speed_mps / HZ for speed_mps in ramp.wheels_mps], 1 / HZ)
+        rolled_m = [share * speed_mps / HZ for speed_mps in ramp.wheels_mps]
+        exact.advance(rolled_m, 1 / HZ)
+        counters.roll(rolled_m)
         if step % (HZ // report_hz) == 0:
             fused.report(*counters.take())
     return fused, exact
@@ -39,12 +39,12 @@ def apart_m(one: Odometry, other: Odometry) -> float:
 
 
 def test_the_counters_forget_what_is_less_than_a_unit() -> None:
-    counters = CreateCounters(ROBOT.base.wheel_separation_m)
-    counters.roll(0.0109, 0.0109)
+    counters = CreateCounters(ROBOT.drive)
+    counters.roll((0.0109, 0.0109))
     assert counters.take() == (10, 0)
-    counters.roll(0.0109, 0.0109)
+    counters.roll((0.0109, 0.0109))
     assert counters.take() == (10, 0)
-    counters.roll(-0.0015, 0.0035)
+    counters.roll((-0.0015, 0.0035))
     assert counters.take() == (1, 1)
 
 
@@ -72,17 +72,17 @@ def test_blocked_wheels_are_not_believed_to_turn() -> None:
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_arcs_are_integrated_exactly(left_m: float, right_m: float) -> None:
-    whole, pieces = Odometry(ROBOT.base), Odometry(ROBOT.base)
-    whole.advance(left_m, right_m, 1.0)
+    whole, pieces = Odometry(ROBOT.drive), Odometry(ROBOT.drive)
+    whole.advance((left_m, right_m), 1.0)
     for _ in range(100):
-        pieces.advance(left_m / 100, right_m / 100, 0.01)
+        pieces.advance((left_m / 100, right_m / 100), 0.01)
     assert apart_m(whole, pieces) < 1e-9
     assert whole.yaw_rad == pytest.approx(pieces.yaw_rad, abs=1e-12)
 
 
 def test_turning_on_the_spot_is_measured_at_the_wheels_distance() -> None:
-    odometry = Odometry(ROBOT.base)
-    around_m = pi * ROBOT.base.wheel_separation_m / 2
-    odometry.advance(-around_m, around_m, 1.0)
+    odometry = Odometry(ROBOT.drive)
+    around_m = pi * ROBOT.base.axle_m / 2
+    odometry.advance((-around_m, around_m), 1.0)
     assert odometry.yaw_rad == pytest.approx(pi)
     assert hypot(odometry.x_m, odometry.y_m) < 1e-12

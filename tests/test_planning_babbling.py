@@ -13,7 +13,6 @@ from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
-from cocoro.differential import wheels_of
 from cocoro.joints import GROUPS
 from cocoro.learning.handmap import NominalModel
 from cocoro.messages import (
@@ -169,7 +168,8 @@ class Body:
         if isinstance(message, ServoCommand):
             self.angles.update(zip(message.joints, message.goal_rad, strict=True))
         elif isinstance(message, BaseCommand):
-            self._wheels = wheels_of(self.robot.base, message)
+            left, right = self.robot.drive.wheels_of(message)
+            self._wheels = left, right
         elif isinstance(message, PlannerStatus):
             self.status = message
         elif isinstance(message, HandSample | WheelTrial):
@@ -181,7 +181,7 @@ class Body:
         heading = self.base[2] + turn / 2
         way = (left + right) / 2 * dt_s
         self.base += [way * np.cos(heading), way * np.sin(heading), turn]
-        self.told_yaw_rad += (right - left) * dt_s / self.robot.base.wheel_separation_m
+        self.told_yaw_rad += (right - left) * dt_s / self.robot.base.axle_m
 
     def _states(self) -> list[Sample]:
         left, right = self._wheels
@@ -221,7 +221,7 @@ def intent(name: str, count: int, first: int = 1, label: str = "") -> Intent:
 
 
 def test_the_arm_babbles_until_there_are_samples_enough_and_comes_home(robot: Robot, postures: Postures) -> None:
-    body = Body(robot, robot.base.wheel_separation_m)
+    body = Body(robot, robot.base.axle_m)
     status = body.run(intent("babble-arm", 90), ticks=4000)
     assert (status.state, status.why) == ("done", "90 samples")
     samples = [output.message for output in body.reports]
@@ -237,7 +237,7 @@ def test_the_arm_babbles_until_there_are_samples_enough_and_comes_home(robot: Ro
 
 
 def test_babbling_goes_on_from_the_draw_that_it_is_told(robot: Robot) -> None:
-    body = Body(robot, robot.base.wheel_separation_m)
+    body = Body(robot, robot.base.axle_m)
     body.run(intent("babble-arm", 30, first=500), ticks=2500)
     draws = [output.message.draw for output in body.reports if isinstance(output.message, HandSample)]
     assert min(draws) >= 500
@@ -245,7 +245,7 @@ def test_babbling_goes_on_from_the_draw_that_it_is_told(robot: Robot) -> None:
 
 
 def test_all_the_way_nothing_comes_near_to_the_robot_itself(robot: Robot, postures: Postures) -> None:
-    body = Body(robot, robot.base.wheel_separation_m)
+    body = Body(robot, robot.base.axle_m)
     body.run(intent("babble-arm", 1000), ticks=200)  # unfolded by now
     for _ in range(1200):
         body.run(intent("babble-arm", 1000), ticks=1)
@@ -263,7 +263,7 @@ def test_the_wheels_go_to_and_fro_and_tell_their_distance(robot: Robot) -> None:
         assert isinstance(one, WheelTrial)
         assert isinstance(other, WheelTrial)
         assert (other.trial, other.left_mps, other.right_mps) == (one.trial + 1, -one.left_mps, -one.right_mps)
-        told_m = one.turned_rad * robot.base.wheel_separation_m
+        told_m = one.turned_rad * robot.base.axle_m
         turned = np.arctan2(one.before_m[1], one.before_m[0]) - np.arctan2(one.after_m[1], one.after_m[0])
         if abs(one.way_m) < 0.01:
             assert told_m / turned == pytest.approx(0.255, abs=0.002)
@@ -272,7 +272,7 @@ def test_the_wheels_go_to_and_fro_and_tell_their_distance(robot: Robot) -> None:
 
 
 def test_without_the_target_the_wheels_stay_still(robot: Robot) -> None:
-    body = Body(robot, robot.base.wheel_separation_m)
+    body = Body(robot, robot.base.axle_m)
     status = body.run(intent("babble-wheels", 8, label="green_can"), ticks=500)
     assert (status.state, status.reason) == ("failed", "lost")
     assert np.array_equal(body.base, np.zeros(3))

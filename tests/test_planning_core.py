@@ -15,7 +15,6 @@ from message_samples import data_of
 from planner_rig import CAN_M, ROBOT, TICK_S, Planner, standing, started
 
 from cocoro import topics
-from cocoro.differential import faster_mps
 from cocoro.messages import Detection, Detections, Message, ServoState
 from cocoro.topics import Topic
 
@@ -147,7 +146,7 @@ def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand
         status = planner.tick()
         wheels = planner.wheels
         until_s = (planner.under_test.now_ns - heard_ns) / 1e9 + TICK_S  # it is what counts until the next step
-        ramp_s = faster_mps(base, wheels) / base.wheel_acceleration_mps2
+        ramp_s = base.drive.fastest_mps(wheels) / base.wheel_acceleration_mps2
         assert until_s + ramp_s <= base.stand_within_s - base.stand_reserve_s + 1e-9 or standing(planner)
         if 0 < wheels.ahead_mps < 0.9 * full_mps:
             assert status.why.startswith("slower, for ")
@@ -344,4 +343,4 @@ def test_nothing_that_passes_the_border_brings_it_down(
     assert planner.status.why
     limit = ROBOT.base.max_wheel_speed_mps
     for command in planner.under_test.outputs(topics.BASE_COMMAND):
-        assert faster_mps(ROBOT.base, command) <= limit + 1e-9
+        assert ROBOT.drive.fastest_mps(command) <= limit + 1e-9

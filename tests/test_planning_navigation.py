@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cocoro.differential import faster_mps
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
@@ -65,8 +64,8 @@ def test_from_every_bearing_the_target_comes_to_where_the_arm_reaches(distance_m
     target = (distance_m * cos(bearing_rad), distance_m * sin(bearing_rad), 0.0)
     x, y, _ = base.pose.inverse().apply(target)
     assert hypot(x - AIM_M[0], y - AIM_M[1]) < 0.05
-    lead = max(CONFIG.acceleration_mps2, CONFIG.turn_acceleration_radps2 * ROBOT.base.wheel_separation_m / 2) * TICK_S
-    assert max(faster_mps(ROBOT.base, command) for command in base.commands) <= ROBOT.base.max_wheel_speed_mps
+    lead = max(CONFIG.acceleration_mps2, CONFIG.turn_acceleration_radps2 * ROBOT.base.axle_m / 2) * TICK_S
+    assert max(ROBOT.drive.fastest_mps(command) for command in base.commands) <= ROBOT.base.max_wheel_speed_mps
     assert base.speeds[-1] == pytest.approx((0.0, 0.0), abs=lead)
 
 
@@ -104,7 +103,7 @@ def test_a_wheel_that_cannot_go_faster_slows_the_other_and_the_arc_is_kept(
     command = driver.command(0.0, 0.0, TICK_S)
     for _ in range(round(seconds / TICK_S)):
         command = driver.command(speed, turn, TICK_S)
-    fastest = faster_mps(ROBOT.base, command)
+    fastest = ROBOT.drive.fastest_mps(command)
     assert fastest <= ROBOT.base.max_wheel_speed_mps + 1e-9
     asked_speed, asked_turn = driver._speed_mps, driver._turn_radps
     is_speed, is_turn = command.ahead_mps, command.turn_radps

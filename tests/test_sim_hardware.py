@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cocoro.differential import command_of
 from cocoro.joints import Group
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
@@ -205,22 +204,22 @@ def test_without_backlash_the_servo_drives_the_joint_to_its_goal_and_with_it_the
 
 def run(base: MobileBase, seconds: float, command: BaseCommand | None, start_ns: int = 0) -> tuple[int, float]:
     """Drive the wheels with commands at 48 Hz. Returns the time and the largest change of speed, m/s^2."""
-    steepest, before = 0.0, base.ramp.left_mps
+    steepest, before = 0.0, base.ramp.wheels_mps[0]
     for step in range(round(seconds * HZ)):
         now_ns = start_ns + step * 1_000_000_000 // HZ
         if command is not None and step % 5 == 0:
             base.command(command, now_ns)
-        left, right = base.wheels(now_ns, 1 / HZ)
-        base.rolled(left / HZ, right / HZ, now_ns, 1 / HZ)
-        steepest = max(steepest, abs(left - before) * HZ)
-        before = left
+        wheels_mps = base.wheels(now_ns, 1 / HZ)
+        base.rolled([speed_mps / HZ for speed_mps in wheels_mps], now_ns, 1 / HZ)
+        steepest = max(steepest, abs(wheels_mps[0] - before) * HZ)
+        before = wheels_mps[0]
     return start_ns + round(seconds * 1e9), steepest
 
 
 def test_wheel_speeds_are_ramped_and_clipped() -> None:
     base = MobileBase(ROBOT.base, exact=True)
-    _, steepest = run(base, 1.0, command_of(ROBOT.base, 3.0, -3.0))
-    assert (base.ramp.left_mps, base.ramp.right_mps) == (0.5, -0.5)
+    _, steepest = run(base, 1.0, ROBOT.drive.command_of((3.0, -3.0)))
+    assert base.ramp.wheels_mps == (0.5, -0.5)
     assert steepest == pytest.approx(ROBOT.base.wheel_acceleration_mps2)
 
 
@@ -228,10 +227,10 @@ def test_the_base_stops_when_commands_stop() -> None:
     base = MobileBase(ROBOT.base, exact=True)
     now_ns, _ = run(base, 1.0, BaseCommand(ahead_mps=0.2, turn_radps=0.0))
     now_ns, _ = run(base, 0.7 * ROBOT.base.command_timeout_s, None, now_ns)
-    assert base.ramp.left_mps == pytest.approx(0.2)
+    assert base.ramp.wheels_mps[0] == pytest.approx(0.2)
     assert base.state(now_ns).stopped_by == ""
     now_ns, _ = run(base, 0.2, None, now_ns)
-    assert base.ramp.left_mps == 0.0
+    assert base.ramp.wheels_mps[0] == 0.0
     assert base.state(now_ns).stopped_by == "no command"
 
 
@@ -241,25 +240,25 @@ def test_a_latched_base_stops_refuses_and_does_not_resume_an_old_command() -> No
     now_ns, _ = run(base, 1.0, ahead)
     base.set_latch("latched")
     now_ns, _ = run(base, 0.25, None, now_ns)
-    assert base.ramp.left_mps == 0.0
+    assert base.ramp.wheels_mps[0] == 0.0
     assert base.command(ahead, now_ns) == "estop"
     assert base.state(now_ns).stopped_by == "estop"
     base.set_latch("released")
     now_ns, _ = run(base, 0.1, None, now_ns)
-    assert base.ramp.left_mps == 0.0
+    assert base.ramp.wheels_mps[0] == 0.0
 
 
 def test_a_pressed_bumper_forbids_forward_but_lets_the_base_back_off_and_turn() -> None:
     base = MobileBase(ROBOT.base, exact=True)
     base.bumper = Bumper(left=True)
     now_ns, _ = run(base, 0.5, BaseCommand(ahead_mps=0.3, turn_radps=0.0))
-    assert (base.ramp.left_mps, base.ramp.right_mps) == (0.0, 0.0)
+    assert base.ramp.wheels_mps == (0.0, 0.0)
     state = base.state(now_ns)
     assert (state.stopped_by, state.bump_left, state.bump_right) == ("bump", True, False)
-    now_ns, _ = run(base, 0.5, command_of(ROBOT.base, 0.3, 0.1), now_ns)
-    assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((0.1, -0.1))
-    now_ns, _ = run(base, 0.5, command_of(ROBOT.base, -0.3, -0.2), now_ns)
-    assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((-0.3, -0.2))
+    now_ns, _ = run(base, 0.5, ROBOT.drive.command_of((0.3, 0.1)), now_ns)
+    assert base.ramp.wheels_mps == pytest.approx((0.1, -0.1))
+    now_ns, _ = run(base, 0.5, ROBOT.drive.command_of((-0.3, -0.2)), now_ns)
+    assert base.ramp.wheels_mps == pytest.approx((-0.3, -0.2))
     assert base.state(now_ns).stopped_by == ""
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.differential import command_of
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from sim.motion import MotionWriter, read_motion
@@ -26,7 +25,7 @@ def test_each_step_has_its_row_and_the_rows_add_up_to_the_way(tmp_path: Path) ->
         start = world.body_pose()
         for step in range(240):
             if step < 120 and step % 5 == 0:
-                world.command_base(command_of(ROBOT.base, 0.3, 0.2, world.time_ns))
+                world.command_base(ROBOT.drive.command_of((0.3, 0.2), world.time_ns))
             world.step()
             writer.step()
         writer.flush()

@@ -26,7 +26,7 @@ def test_the_same_seed_is_the_same_body_and_another_is_another(robot: Robot) -> 
     assert one.robot.to_data() == same.robot.to_data()
     assert one.slip_radps == same.slip_radps
     assert one.robot.to_data() != other.robot.to_data()
-    assert one.robot.base.wheel_separation_m != other.robot.base.wheel_separation_m
+    assert one.robot.base.axle_m != other.robot.base.axle_m
 
 
 def test_lengths_zeros_marker_and_wheels_stay_within_their_bounds(robot: Robot) -> None:
@@ -39,7 +39,7 @@ def test_lengths_zeros_marker_and_wheels_stay_within_their_bounds(robot: Robot) 
             assert abs(degrees(real.offset_rad - drawn.offset_rad)) <= 2.0
         off = np.subtract(worn.marker.position_m, robot.marker.position_m)
         assert np.linalg.norm(off) == pytest.approx(0.005)
-        assert abs(worn.base.wheel_separation_m - robot.base.wheel_separation_m) <= 0.008
+        assert abs(worn.base.axle_m - robot.base.axle_m) <= 0.008
 
 
 def test_the_camera_is_mounted_off_by_a_degree_and_five_millimetres_at_most(robot: Robot) -> None:
@@ -87,7 +87,7 @@ def test_the_world_is_built_from_the_worn_body_while_its_odometry_keeps_the_draw
         assert 0.003 < np.linalg.norm(marker - drawn) < 0.06
         yaw = 2 * np.arctan2(truth.body_orientation[2], truth.body_orientation[3])
         ratio = world.base_state().odometry_yaw_rad / yaw
-        assert ratio == pytest.approx(wear.robot.base.wheel_separation_m / robot.base.wheel_separation_m, abs=2e-3)
+        assert ratio == pytest.approx(wear.robot.base.axle_m / robot.base.axle_m, abs=2e-3)
 
 
 @pytest.mark.sim

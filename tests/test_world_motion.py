@@ -40,7 +40,7 @@ def test_the_base_goes_where_its_wheels_roll(empty: World, left_mps: float, righ
     # 3 s of commands, then the deadman time; the two ramps cancel.
     held_s = 3.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240
     assert state.odometry_yaw_rad == pytest.approx(
-        (right_mps - left_mps) / ROBOT.base.wheel_separation_m * held_s, rel=0.01, abs=0.002
+        (right_mps - left_mps) / ROBOT.base.axle_m * held_s, rel=0.01, abs=0.002
     )
     assert (state.speed_mps, state.turn_rate_radps) == pytest.approx((0.0, 0.0), abs=1e-3)
 
@@ -166,7 +166,7 @@ def test_real_wheels_differ_from_what_odometry_believes_and_ideal_ones_do_not() 
             truth, state = world.truth(), world.base_state()
             errors.append(truth.body_m[0] - state.odometry_m[0])
             assert abs(truth.body_m[0] / state.odometry_m[0] - 1.0) < 0.03
-            assert abs(yaw_of(truth)) < 0.05 * 0.84 / ROBOT.base.wheel_separation_m
+            assert abs(yaw_of(truth)) < 0.05 * 0.84 / ROBOT.base.axle_m
             # A Create's driver knows only the commanded wheel speeds; here the wheels followed them.
             held_s = 4.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240
             assert state.odometry_m[0] == pytest.approx(0.2 * held_s, rel=0.005)

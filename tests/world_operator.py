@@ -8,7 +8,6 @@ from math import asin, atan2, cos, pi, radians
 import numpy as np
 
 from cocoro.arrays import FloatArray
-from cocoro.differential import command_of
 from cocoro.joints import GROUPS
 from cocoro.messages import ServoCommand, TrueObject, Truth
 from cocoro.robot import Robot
@@ -59,7 +58,7 @@ class Operator:
                             ),
                         )
                 if wheels_mps:
-                    self.world.command_base(command_of(self.world.robot.base, *wheels_mps))
+                    self.world.command_base(self.world.robot.drive.command_of(wheels_mps))
             self.world.step()
             if step % 8 == 7:
                 truth = self.world.truth()

@@ -143,7 +143,7 @@ def _mm(metres: float) -> str:
 
 
 def _wheels_text(fit: WheelFit, robot: Robot) -> str:
-    nominal_m = robot.base.wheel_separation_m
+    nominal_m = robot.base.axle_m
     doubt = "" if isnan(fit.sigma_m) else f" +- {1000 * fit.sigma_m:.1f}"
     rows = [
         ("learned, from all trials at once", f"{1000 * fit.separation_m:.1f}{doubt}"),

@@ -32,7 +32,7 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         f"A can 1.5 m ahead; {settings.trials} trials, in pairs of a Sobol draw within ±0.15 m/s for each wheel for 1 s"
         " and its reverse. The can is seen before and after each.",
     )
-    nominal_m = settings.robot().base.wheel_separation_m
+    nominal_m = settings.robot().base.axle_m
     for measure, key in (("wheel distance", "wheel_separation_m"), ("distance that turns it", "turning_separation_m")):
         axle = key == "wheel_separation_m"
         true_m = [body[key] for _, body in good]

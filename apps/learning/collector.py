@@ -113,7 +113,7 @@ class WheelCollector(SampleCollector[WheelRow]):
 
     def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
         """`target_height_m`: height of the target's centre above the floor, if it is known."""
-        self._separation_m = robot.base.wheel_separation_m
+        self._separation_m = robot.base.axle_m
         super().__init__(SampleFile(path, WheelRow, robot, wheel_header(robot, target_height_m)))
 
     @property

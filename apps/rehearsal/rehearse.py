@@ -294,12 +294,12 @@ class _Rehearsal:
 
     def _true_body(self) -> dict[str, Any]:
         request, separation_m = self._request, self._body.base.wheel_separation_m
-        scales = wheel_scales(request.seed, REALISM[request.sensors])
+        scales = wheel_scales(request.seed, REALISM[request.sensors], len(self._body.drive.names))
         return {
             "kind": request.body,
             "wheel_separation_m": separation_m,
             # Wheels that roll further than commanded turn the robot as if they were closer together.
-            "turning_separation_m": separation_m / float(scales.mean()),
+            "turning_separation_m": separation_m and separation_m / float(scales.mean()),
         }
 
     def _result(self, state: TaskState) -> dict[str, Any]:

@@ -44,7 +44,9 @@ def fingerprint_of(robot: Robot) -> str:
         "link": data["link"],
         "joint": [(one.name, one.direction, one.centre_count) for one in robot.joints.values()],
         "marker": data["marker"],
-        "base": [data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m")],
+        "base": [
+            data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m", "wheel") if data["base"][name]
+        ],
         "kinect": {
             field.name: data["kinect"][field.name]
             for field in msgspec.structs.fields(robot.kinect)

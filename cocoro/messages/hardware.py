@@ -70,6 +70,8 @@ class BaseState(Message):
     """Forward speed by odometry."""
     turn_rate_radps: Finite
     """Turn rate by odometry, counter-clockwise."""
+    aside_mps: Finite = 0.0
+    """Speed to the left by odometry; 0 for a base that cannot move aside."""
     bump_left: bool = False
     bump_right: bool = False
     wheel_drop: bool = False
@@ -85,6 +87,11 @@ class BaseState(Message):
     stopped_by: str = ""
     """Why the base refuses or zeroes wheel commands ('' when it obeys): estop, latch unknown, bump, cliff, wheel drop,
     overcurrent, no command, mode (the Create left its mode), link."""
+
+    @property
+    def standing(self) -> bool:
+        """Whether it moves no faster than what an odometry shows of a base at rest."""
+        return abs(self.speed_mps) < 0.01 and abs(self.aside_mps) < 0.01 and abs(self.turn_rate_radps) < 0.03
 
 
 class BaseCommand(Message):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
+from cocoro.base import Base
 from cocoro.clock import NS, is_fresh
-from cocoro.description import Base
-from cocoro.differential import wheels_of
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
@@ -51,7 +50,8 @@ class BaseDriver:
         self.why = "the guard has not reported yet"
         self._base = base
         self._timeout_ns = round(base.command_timeout_s * NS)
-        self._odometry = Odometry(base)
+        self._drive = base.drive
+        self._odometry = Odometry(self._drive)
         self._ramp = WheelRamp(base)
         self._wanted_mmps = (0, 0)
         self._until_ns = -1
@@ -69,7 +69,7 @@ class BaseDriver:
         if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
             return
         try:
-            wheels_mps = wheels_of(self._base, command)
+            wheels_mps = self._drive.wheels_of(command)
         except ValueError:  # what it cannot do
             return
         limit_mmps = self._base.max_wheel_speed_mps * 1000.0
@@ -120,11 +120,10 @@ class BaseDriver:
         dt_s = min((now_ns - self._frame_ns) / NS, LONGEST_S)
         obeying = oi.MODES[readings[oi.MODE]] in ("safe", "full")
         left_mps, right_mps = (readings[side] / 1000.0 if obeying else 0.0 for side in (oi.LEFT_SPEED, oi.RIGHT_SPEED))
-        before = self._ramp.left_mps, self._ramp.right_mps
-        self._ramp.advance(left_mps, right_mps, dt_s)
-        self._odometry.advance(
-            (before[0] + self._ramp.left_mps) / 2 * dt_s, (before[1] + self._ramp.right_mps) / 2 * dt_s, dt_s
-        )
+        before = self._ramp.wheels_mps
+        self._ramp.advance((left_mps, right_mps), dt_s)
+        rolled_m = [(was + now) / 2 * dt_s for was, now in zip(before, self._ramp.wheels_mps, strict=True)]
+        self._odometry.advance(rolled_m, dt_s)
 
     # --- state --------------------------------------------------------------------------------------
 
@@ -140,6 +139,7 @@ class BaseDriver:
             odometry_yaw_rad=odometry.yaw_rad,
             speed_mps=odometry.speed_mps,
             turn_rate_radps=odometry.turn_rate_radps,
+            aside_mps=odometry.aside_mps,
             bump_left=bool(bumps & oi.BUMP_LEFT),
             bump_right=bool(bumps & oi.BUMP_RIGHT),
             wheel_drop=bool(bumps & oi.WHEEL_DROPS),

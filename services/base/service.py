@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from cocoro import topics
 from cocoro.component import Implementation
+from cocoro.errors import ConfigError
 from cocoro.faults import FaultReporter
 from cocoro.latch import ServiceLatch
 from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
@@ -39,6 +40,8 @@ class BaseService:
     def __init__(self, node: Node, config: BaseConfig) -> None:
         self._node = node
         self._reporter = FaultReporter(node)
+        if node.robot.base.kind != "differential":
+            raise ConfigError(f"a Create has two wheels on one axle, but [base] kind = {node.robot.base.kind!r}")
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
         robot = node.robot_name if node.latches is not None else None

@@ -184,7 +184,7 @@ class Cockpit:
             "body": {"radius_m": robot.base.chassis_diameter_m / 2},
             "limits": {
                 "speed_mps": speed_mps,
-                "turn_radps": round(2 * speed_mps / robot.base.wheel_separation_m, 3),
+                "turn_radps": round(speed_mps / robot.drive.lever_m, 3),
                 "pan_radps": robot.joints[robot.head.pan].max_speed_radps,
                 "tilt_radps": robot.joints[robot.head.tilt].max_speed_radps,
             },

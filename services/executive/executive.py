@@ -259,7 +259,7 @@ class Executive:
 
     @staticmethod
     def _standing(base: BaseState | None) -> bool:
-        return base is not None and abs(base.speed_mps) < 0.01 and abs(base.turn_rate_radps) < 0.03
+        return base is not None and base.standing
 
     def _finish(self, outcome: Outcome, reason: str) -> None:
         self._close_phase()

@@ -59,8 +59,8 @@ class PlanningCore:
         self.actuators.reachability.use(learned.map, learned.mesh)
         self.actuators.camera_tilt = self._estimator.camera_tilt = learned.camera_tilt
         self.actuators.driver.turn_with(learned.separation_m)
-        drawn_m = self.actuators.robot.base.wheel_separation_m
-        self._estimator.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
+        base, learned_m = self.actuators.robot.base, learned.separation_m
+        self._estimator.turning.ratio = base.axle_m / learned_m if learned_m is not None else 1.0
 
     reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
         topics.BASE_STATE: "all",

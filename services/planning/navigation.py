@@ -11,8 +11,9 @@ from __future__ import annotations
 from math import asin, atan2, copysign, hypot, sin, sqrt
 from typing import NamedTuple
 
-from cocoro.description import Base
-from cocoro.differential import command_of, faster_mps
+from cocoro.base import Base
+from cocoro.differential import Differential
+from cocoro.drive import Twist, WheelDrive
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.messages import BaseCommand
 from services.planning.config import NavigationConfig
@@ -55,13 +56,14 @@ class Driver:
     def __init__(self, config: NavigationConfig, base: Base) -> None:
         self._config = config
         self._base = base
-        self._separation_m = base.wheel_separation_m
+        self._drive = base.drive
+        self._turns_with: WheelDrive = self._drive
         self._speed_mps = 0.0
         self._turn_radps = 0.0
 
     def turn_with(self, separation_m: float | None) -> None:
-        """Use a learned wheel distance; None is the nominal one."""
-        self._separation_m = separation_m if separation_m is not None else self._base.wheel_separation_m
+        """Use a learned distance of the two wheels of a differential base; None is the nominal one."""
+        self._turns_with = self._drive if separation_m is None else Differential(separation_m)
 
     def reset(self) -> None:
         self._speed_mps = self._turn_radps = 0.0
@@ -134,7 +136,7 @@ class Driver:
 
     def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, pace: float = 1.0) -> BaseCommand:
         """Approach a speed and turn rate within the acceleration limits. `pace` is the share of the limits that is used
-        to go faster and to turn; to go slower, all of them are. When a wheel saturates, both wheels are scaled, which
+        to go faster and to turn; to go slower, all of them are. When a wheel saturates, all wheels are scaled, which
         keeps the arc."""
         config = self._config
         faster = abs(speed_mps) > abs(self._speed_mps) and speed_mps * self._speed_mps >= 0
@@ -143,16 +145,15 @@ class Driver:
         limit = pace * config.max_turn_radps
         turn_radps = min(max(turn_radps, -limit), limit)
         self._turn_radps = _approach(self._turn_radps, turn_radps, pace * config.turn_acceleration_radps2 * dt_s)
-        half = self._turn_radps * self._separation_m / 2
-        left, right = self._speed_mps - half, self._speed_mps + half
-        excess = max(abs(left), abs(right)) / self._base.max_wheel_speed_mps
+        wheels_mps = self._turns_with.wheels(Twist(self._speed_mps, self._turn_radps))
+        excess = max(abs(speed_mps) for speed_mps in wheels_mps) / self._base.max_wheel_speed_mps
         if excess > 1.0:
-            left, right = left / excess, right / excess
-        return command_of(self._base, left, right)
+            wheels_mps = tuple(speed_mps / excess for speed_mps in wheels_mps)
+        return self._drive.command_of(wheels_mps)
 
     def within(self, command: BaseCommand, limit_mps: float) -> BaseCommand:
         """Scale a command on its arc until no wheel exceeds a limit; the next command continues from there."""
-        fastest_mps = faster_mps(self._base, command)
+        fastest_mps = self._drive.fastest_mps(command)
         if fastest_mps <= limit_mps:
             return command
         share = limit_mps / fastest_mps
@@ -163,8 +164,7 @@ class Driver:
     def pause(self, dt_s: float) -> BaseCommand:
         """A zero command while a publisher is late. The next command continues from the speed that the base's own
         ramp has left."""
-        half = self._turn_radps * self._separation_m / 2
-        fastest_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))
+        fastest_mps = self._turns_with.fastest(Twist(self._speed_mps, self._turn_radps))
         rest_mps = max(fastest_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
         share = rest_mps / fastest_mps if fastest_mps > 0.0 else 0.0
         self._speed_mps *= share

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import select
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import radians
 from pathlib import Path
 
+from cocoro.base import Base
 from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.component import Implementation
-from cocoro.description import Base
 from cocoro.errors import CocoroError
 from cocoro.joints import GROUPS, Group, Joint
 from cocoro.node import Node
@@ -81,10 +81,10 @@ class WireBase(MobileBase):
         self.counted_m = [0.0, 0.0]
         """Distance that each wheel's encoder has measured since the start."""
 
-    def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
-        self.counted_m = [self.counted_m[0] + left_m, self.counted_m[1] + right_m]
+    def rolled(self, rolled_m: Sequence[float], now_ns: int, dt_s: float) -> None:
+        self.counted_m = [counted + rolled for counted, rolled in zip(self.counted_m, rolled_m, strict=True)]
 
-    def _allowed_mps(self, now_ns: int) -> tuple[float, float]:
+    def _allowed_mps(self, now_ns: int) -> tuple[float, ...]:
         return self.asked_mps
 
 
@@ -160,7 +160,7 @@ def setup_of(robot: Robot, motors: WireMotors, seed: int) -> Setup:
         ]
         for line, (protocol, joints) in servos_on_lines(robot).items()
     }
-    return Setup(robot.base.wheel_separation_m * 1000.0, lines, seed)
+    return Setup(robot.base.axle_m * 1000.0, lines, seed)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output
-from cocoro.differential import command_of
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand, HandSample, WheelTrial
 from cocoro.messages.actions import BabbleArm, BabbleWheels
@@ -195,6 +194,10 @@ class WheelBabbling:
 
     def step(self, snapshot: Snapshot) -> Plan:
         self._begun = self._begun or snapshot.body
+        kind = snapshot.actuators.robot.base.kind
+        if kind != "differential":
+            why = f"a base of the kind {kind!r} has no two wheels whose distance is to be learned"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "unreachable")
         snapshot.estimator.watch(self._label)
         sightings = snapshot.estimator.sightings_of(self._label)
         if self._phase_ns is None:
@@ -216,8 +219,7 @@ class WheelBabbling:
 
     def _drive(self, snapshot: Snapshot, spent_s: float) -> BaseCommand:
         if spent_s < self.TURN_S:
-            left, right = self._speeds
-            return command_of(snapshot.actuators.robot.base, left, right)
+            return snapshot.actuators.robot.drive.command_of(self._speeds)
         snapshot.actuators.driver.reset()
         if snapshot.standing:
             self._driving, self._phase_ns = False, None
@@ -287,7 +289,7 @@ class WheelBabbling:
         """Wheel speeds of the next pair, m/s: those of the next draw that turns the robot far enough."""
         for number, speeds in self._draws:
             left, right = speeds.tolist()
-            if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * snapshot.actuators.robot.base.wheel_separation_m:
+            if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * snapshot.actuators.robot.base.axle_m:
                 self._trial = 2 * number
                 return left, right
         raise AssertionError("draws have no end")

@@ -145,7 +145,7 @@ class Snapshot:
     @property
     def standing(self) -> bool:
         base = self.estimator.base
-        return base is not None and abs(base.speed_mps) < 0.01 and abs(base.turn_rate_radps) < 0.03
+        return base is not None and base.standing
 
     def stand(self) -> BaseCommand:
         return self.actuators.driver.brake(self.dt_s)
