@@ -4,17 +4,21 @@ Chassis, wheels, the mounting box, the marker and the claws' pads follow from th
 has the rest. The claws' pads are put at equal height: in the maker's drawing they are 32 mm apart, which would tip a
 can over.
 
-An omni wheel is one that touches the floor in one point, too, whose friction there acts along the direction in which it
-drives, and not along its axle: what is left of ideal rollers, which turn without resistance, when the motion of each is
-left out. Its force on the floor is the motor's, up to friction times load, and a wheel that the others push along its
-axle follows freely; so the body moves as the wheels' kinematics say, and slips or stands where they cannot hold it.
-Left out: the rollers' mass and drag, the jolt from roller to roller, and the change of the point of contact from one
-row of rollers to the other.
+An omni wheel is a wheel as the others on a hub that slides along the axle without resistance, and that is set back to
+its place before each step, by a millimetre at most. So the floor's friction holds the wheel, and no force along the
+axle gets from it to the body: what ideal rollers do. Along its driving direction it pushes with its motor's torque, up
+to friction times load. The body therefore moves as the kinematics of its wheels say, slips where they push more than
+the floor holds, and is held up by what it meets. Left out: the rollers' drag, the jolt from roller to roller, the
+change of the point of contact from one row of rollers to the other, and the inertia of the wheels' own mass along their
+axles. (PyBullet's anisotropic friction would need no hub. But friction along one direction alone is two parallel rows
+of its solver; where the axle lies along one of the world's axes one row is nearly empty, takes all of the friction
+cone, and the wheel slips.)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -45,19 +49,19 @@ class Friction:
     lateral: float = 0.6
     spinning: float = 0.0
     rolling: float = 0.0
-    rollers: bool = False
-    """None of it acts along the link's y axis."""
 
 
 @dataclass(frozen=True)
 class Extra:
-    """A link that is not in the description: fixed on the chassis, or a wheel that turns about y."""
+    """A link that is not in the description: fixed, a wheel that turns about y, or the hub of an omni wheel, which
+    slides along y."""
 
     name: str
     position_m: tuple[float, float, float]
-    wheel: bool = False
+    kind: Literal["fixed", "wheel", "hub"] = "fixed"
     turn_rad: float = 0.0
     """About z: direction in which a wheel drives."""
+    parent: str = CHASSIS
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,10 @@ def body_of_parts(robot: Robot) -> SimBody:
         if part.solid:
             extras.append(Extra(part.name, part.position_m))
             parts[part.name] = [msgspec.structs.replace(part, link=part.name, position_m=(0.0, 0.0, 0.0))]
-    wheels, casters = _wheels(base), CASTERS if base.kind == "differential" else ()
-    radii = {wheel.name: wheel.position_m[2] for wheel in wheels}
+    wheels, radii = _wheels(base)
+    casters = CASTERS if base.kind == "differential" else ()
     parts |= {name: _wheel(name, radius_m) for name, radius_m in radii.items()}
+    parts |= {wheel.name: [_hub(wheel.name)] for wheel in wheels if wheel.kind == "hub"}
     parts |= {name: [_caster(name)] for name in casters}
     for part in robot.solid.part:
         if part.link != "body":
@@ -137,28 +142,32 @@ def body_of_parts(robot: Robot) -> SimBody:
         *wheels,
         *(Extra(name, (x, 0.0, CASTER_RADIUS_M)) for name, x in zip(casters, (CASTER_X_M, -CASTER_X_M), strict=False)),
     ]
-    friction = dict.fromkeys(radii, Friction(1.0, rollers=base.kind == "omni"))
-    friction |= dict.fromkeys(casters, Friction(0.0))
+    friction = dict.fromkeys(radii, Friction(1.0)) | dict.fromkeys(casters, Friction(0.0))
     friction |= {robot.link_of(jaw): Friction(0.9, spinning=0.01) for jaw in robot.jaws}
     return SimBody(parts, extras, radii, friction)
 
 
-def _wheels(base: Base) -> list[Extra]:
-    """The wheels, each in a frame whose y axis is its axle and whose x axis is where it drives, in the order of the
-    base's drive."""
-    if base.kind == "omni":
-        return [
-            Extra(f"wheel_{wheel.name}", (*wheel.place_m, wheel.radius_m), wheel=True, turn_rad=wheel.drive_rad)
-            for wheel in base.wheel
-        ]
-    assert base.wheel_radius_m is not None
-    left_m = base.axle_m / 2
-    places = zip(base.drive.names, (left_m, -left_m), strict=True)
-    return [Extra(f"wheel_{name}", (0.0, y, base.wheel_radius_m), wheel=True) for name, y in places]
+def _wheels(base: Base) -> tuple[list[Extra], dict[str, float]]:
+    """The links of the wheels, each in a frame whose y axis is its axle and whose x axis is where it drives, and the
+    radii by wheel, m, in the order of the base's drive."""
+    extras: list[Extra] = []
+    if base.wheel_radius_m is not None:
+        left_m, radius_m = base.axle_m / 2, base.wheel_radius_m
+        for name, y in zip(base.drive.names, (left_m, -left_m), strict=True):
+            extras.append(Extra(f"wheel_{name}", (0.0, y, radius_m), "wheel"))
+        return extras, {extra.name: radius_m for extra in extras}
+    for wheel in base.wheel:
+        hub = Extra(f"hub_{wheel.name}", (*wheel.place_m, wheel.radius_m), "hub", wheel.drive_rad)
+        extras += [hub, Extra(f"wheel_{wheel.name}", (0.0, 0.0, 0.0), "wheel", parent=hub.name)]
+    return extras, {f"wheel_{wheel.name}": wheel.radius_m for wheel in base.wheel}
 
 
 def _caster(name: str) -> Part:
     return Part(name, name, "sphere", (CASTER_RADIUS_M,), rgb=_METAL, mass_kg=0.03)
+
+
+def _hub(name: str) -> Part:
+    return Part(name, name, "cylinder", (0.01, 0.02), rgb=_DARK, mass_kg=0.02, axis="y", solid=False)
 
 
 def _wheel(name: str, radius_m: float) -> list[Part]:

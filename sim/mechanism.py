@@ -30,8 +30,6 @@ WHEEL_GAIN = 0.2
 """Share of a wheel's lag that one step corrects."""
 JOINT_GAIN = 0.1
 """Share of a joint's way to its goal that one step covers, within its speed limit; PyBullet's default."""
-ROLLERS = (1.0, 0.0, 1.0)
-"""Shares of the friction along a link's axes, for a link with rollers along y."""
 NO_LIMIT_RADPS = -1.0
 """PyBullet's value for a motor without a speed limit."""
 
@@ -67,6 +65,7 @@ class Mechanism:
         link_of_joint = {joint: link for link, joint in joint_of_link.items()}
         self._motors = {joint: self.index[link_of_joint[joint]] for joint in self.joints}
         self._wheels = tuple(self.index[wheel] for wheel in model.body.wheels)
+        self._hubs = [self.index[extra.name] for extra in model.body.extras if extra.kind == "hub"]
         self._wheel_rad = [0.0] * len(self._wheels)
         self._wheel_goal_rad = [0.0] * len(self._wheels)
         self._read_indices = [*self._motors.values(), *self._wheels]
@@ -75,6 +74,14 @@ class Mechanism:
         self._link_indices = list(range(len(infos)))
         self._prepare(model, angles_rad)
 
+    def roll_on_floor_alone(self, others: Iterable[int]) -> None:
+        """Let omni wheels pass through other bodies: the chassis meets those, which is at least as wide as the wheels,
+        but not as the balls of which the wheels are the middle."""
+        if self._hubs:
+            for other in others:
+                for wheel in self._wheels:
+                    self._bullet.setCollisionFilterPair(self.body, other, wheel, -1, 0)
+
     def drive(self, joint: str, drive: Drive) -> None:
         target_rad, max_speed_radps, max_torque_nm = drive
         self._control(self._motors[joint], target_rad, 0.0, max_torque_nm, JOINT_GAIN, 1.0, max_speed_radps)
@@ -82,6 +89,7 @@ class Mechanism:
     def spin(self, speeds_radps: Iterable[float], dt_s: float) -> None:
         """Turn the wheels at these speeds for the next step, as a controller with encoders does: the lag of one step is
         corrected in the next."""
+        self._centre_hubs()
         for number, speed_radps in enumerate(speeds_radps):
             lag = self._wheel_goal_rad[number] - self._wheel_rad[number]
             lag = min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
@@ -90,6 +98,12 @@ class Mechanism:
             goal = self._wheel_rad[number] + lag
             self._wheel_goal_rad[number] = goal + speed_radps * dt_s
             self._control(self._wheels[number], goal, speed_radps, WHEEL_TORQUE_NM, WHEEL_GAIN, 1.0, NO_LIMIT_RADPS)
+
+    def _centre_hubs(self) -> None:
+        """Set the hubs of omni wheels back to their places on the body, with the speeds that they have."""
+        for hub in self._hubs:
+            speed_mps = self._bullet.getJointState(self.body, hub)[1]
+            self._bullet.resetJointState(self.body, hub, 0.0, speed_mps)
 
     def _control(
         self,
@@ -150,8 +164,6 @@ class Mechanism:
                 rollingFriction=friction.rolling,
                 restitution=0.0,
             )
-            if friction.rollers:
-                bullet.changeDynamics(self.body, self.index[link], anisotropicFriction=ROLLERS)
         bullet.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0)
         pairs = {frozenset(pair) for pair in model.collision_pairs()}
         for one in model.links:
@@ -159,6 +171,9 @@ class Mechanism:
                 if one < other:
                     enabled = int(frozenset((one, other)) in pairs)
                     bullet.setCollisionFilterPair(self.body, self.body, self.index[one], self.index[other], enabled)
+        for hub in self._hubs:
+            bullet.setJointMotorControl2(self.body, hub, bullet.VELOCITY_CONTROL, force=0.0)
+            bullet.changeDynamics(self.body, hub, jointDamping=0.0)
         for joint, index in self._motors.items():
             bullet.resetJointState(self.body, index, angles_rad[joint])
             bullet.changeDynamics(self.body, index, jointDamping=0.0)

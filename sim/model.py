@@ -16,6 +16,9 @@ from cocoro.robot import Robot
 from sim.body import CHASSIS, Extra, SimBody, body_of_parts, inertia_of, pose_of
 from sim.render.interface import Visual
 
+HUB_SLIDES_M = 1.0
+"""More than an omni wheel's hub ever slides in a step."""
+
 
 @dataclass(frozen=True)
 class RobotModel:
@@ -148,7 +151,11 @@ def _geometry_xml(part: Part) -> str:
 def _extra_joint(extra: Extra) -> str:
     place = turn_z(extra.turn_rad) if extra.turn_rad else np.eye(4)
     place[:3, 3] = extra.position_m
-    return _joint_xml(extra.name, CHASSIS, place, "continuous" if extra.wheel else "fixed", axis="0 1 0")
+    if extra.kind == "hub":
+        limit = [f'    <limit lower="-{HUB_SLIDES_M:g}" upper="{HUB_SLIDES_M:g}" effort="0" velocity="0"/>']
+        return _joint_xml(extra.name, extra.parent, place, "prismatic", axis="0 1 0", more=limit)
+    kind = "continuous" if extra.kind == "wheel" else "fixed"
+    return _joint_xml(extra.name, extra.parent, place, kind, axis="0 1 0")
 
 
 def _servo_joint(robot: Robot, link: Link, parent: str, place: FloatArray) -> str:

@@ -26,9 +26,11 @@ from sim.render.interface import Visual
 from sim.scene import Light, Scene
 from sim.seeds import stream
 from sim.servos import Drive, SimServoGroup
-from sim.stage import Stage
+from sim.stage import FLOOR, Stage
 
-SOLVER_ITERATIONS = 50
+SOLVER_ITERATIONS = {"differential": 50, "omni": 150}
+"""By kind of base. What the solver leaves undone turns a standing robot on three wheels alone: by 1.4 degrees a minute
+with 50, by 0.2 with 150."""
 SETTLE_S = 0.5
 SENSE_HZ = 60.0
 """How often contacts are read and new errors of the body are drawn."""
@@ -97,7 +99,7 @@ class World:
         self._bullet.setGravity(0.0, 0.0, -9.81)
         self._bullet.setPhysicsEngineParameter(
             fixedTimeStep=self._dt_s,
-            numSolverIterations=SOLVER_ITERATIONS,
+            numSolverIterations=SOLVER_ITERATIONS[robot.base.kind],
             numSubSteps=0,
             deterministicOverlappingPairs=1,
         )
@@ -107,6 +109,7 @@ class World:
         self._jaws = frozenset(robot.link_of(jaw) for jaw in robot.jaws)
         angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
         self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
+        self._mechanism.roll_on_floor_alone([body for name, body in self._stage.bodies.items() if name != FLOOR])
         self._names = {body: name for name, body in self._stage.bodies.items()}
 
         self._base, self._groups = motors(robot, angles, realism)
