@@ -37,8 +37,10 @@ SHOWN = {topics.PLAN.name, topics.FLOOR_PLAN.name}
 class Planner:
     """A planning core on a robot that follows all commands except to the wheels, and sees a can and free floor."""
 
-    def __init__(self, config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore) -> None:
-        self.under_test = CoreUnderTest(make(ROBOT, config or PlanningConfig()))
+    def __init__(
+        self, config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore, robot: Robot = ROBOT
+    ) -> None:
+        self.under_test = CoreUnderTest(make(robot, config or PlanningConfig()))
         self.angles = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"]
         self.base: dict[str, Any] = {}
         self.hand_load = 0.0

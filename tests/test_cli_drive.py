@@ -40,7 +40,7 @@ def test_space_means_rest_and_an_unknown_key_nothing() -> None:
 
 def test_every_part_has_two_keys_that_move_it_in_opposite_directions() -> None:
     keys = Keys(0.3)
-    for one, other in ("ik", "jl", "tg", "rf", "zx", "vb"):
+    for one, other in (",.", "ik", "jl", "tg", "rf", "zx", "vb"):
         forth, back = keys.motion(one), keys.motion(other)
         assert forth is not None
         assert back is not None

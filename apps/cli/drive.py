@@ -35,6 +35,7 @@ END_S = 5.0
 HELP = """\
 hold a key to move, let go to stand (it moves for 0.2 s, and on from when the keyboard repeats the key):
   w s  arrows  ahead, back        a d  turn left, right      A D  ahead in an arc
+  , .  left, right (a base whose wheels roll aside)
   i k j l      head up, down, left, right
   t g r f z x  hand out, in, up, down, left, right           v b  roll the wrist
   o c          claws open, close  + -  faster, slower        space  stand at once      q  end
@@ -88,6 +89,8 @@ class Keys:
             return Motion(turn_radps=-turn)
         if key in "AD":
             return Motion(speed_mps=ahead, turn_radps=turn / 2 if key == "A" else -turn / 2)
+        if key in (",", "."):
+            return Motion(aside_mps=ahead if key == "," else -ahead)
         return _OTHERS.get(key)
 
     def change_speed(self, key: str) -> None:

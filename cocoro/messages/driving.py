@@ -19,6 +19,8 @@ class Motion(msgspec.Struct, kw_only=True, frozen=True):
     """Of the base, forwards."""
     turn_radps: Finite = 0.0
     """Of the base, counter-clockwise."""
+    aside_mps: Finite = 0.0
+    """Of the base, to the left. A base that cannot move so does not."""
     pan_radps: Finite = 0.0
     """Of the head, to the left."""
     tilt_radps: Finite = 0.0
@@ -42,7 +44,7 @@ class Motion(msgspec.Struct, kw_only=True, frozen=True):
     @property
     def base(self) -> bool:
         """Whether the wheels are to turn."""
-        return self.speed_mps != 0.0 or self.turn_radps != 0.0
+        return any((self.speed_mps, self.turn_radps, self.aside_mps))
 
     @property
     def head(self) -> bool:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from math import copysign
+from math import atan2, copysign, cos, hypot, pi, sin
 from typing import NamedTuple
 
 import numpy as np
 
 from cocoro.arrays import BoolArray, FloatArray
 from cocoro.clock import NS
-from cocoro.frames import Pose2
+from cocoro.frames import Pose2, wrap_rad
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.course import Course, Move
@@ -26,6 +26,8 @@ _TRAIL_M = 0.03
 """Way between two places that the robot remembers to have stood on."""
 _RIM = np.linspace(-1.0, 1.0, 5)
 """Bearings of places on the body's rim, against the direction of motion, rad."""
+_VIEW_RAD = 0.8
+"""Directions of motion up to here from ahead are ones that the camera looks into."""
 
 
 class Allowed(NamedTuple):
@@ -37,6 +39,7 @@ class Allowed(NamedTuple):
     """Why it is less than what was wanted; '' when it is not."""
     look_at: tuple[float, float] | None = None
     """A place ahead, odometry frame, m, whose floor was not seen yet."""
+    aside_mps: float = 0.0
 
 
 class ArmHull(NamedTuple):
@@ -85,17 +88,33 @@ class Caution:
         *,
         arm: ArmHull | None,
         looks: bool,
+        aside_mps: float = 0.0,
     ) -> Allowed:
         """The part of a motion that is safe. `arm`: None when it is folded. `looks`: the head goes where `look_at` of
-        the answer says."""
+        the answer says.
+
+        A motion with a part aside is one straight ahead, or back where the camera does not look, of a body that is
+        turned into its direction: the chassis is round, and the arm is turned with it.
+        """
+        heading = 0.0
+        if aside_mps:
+            bearing = atan2(aside_mps, speed_mps)
+            into_view = abs(bearing) <= _VIEW_RAD
+            heading = bearing if into_view else wrap_rad(bearing + pi)
+            speed_mps = hypot(speed_mps, aside_mps) * (1.0 if into_view else -1.0)
+            body = body.compose(Pose2(0.0, 0.0, heading))
+            arm = arm and arm._replace(places_m=placed(arm.places_m, Pose2(0.0, 0.0, -heading)))
         wanted = Allowed(speed_mps, turn_radps)
         if speed_mps < 0.0:
-            wanted = self._backwards(wanted, body, around, driver)
+            wanted = self._backwards(wanted, body, around, driver, aside=aside_mps != 0.0)
         elif speed_mps > 0.0:
             wanted = self._ahead(wanted, body, around, driver, now_ns, looks=looks)
-        return self._clear(wanted, body, fields, driver, arm)
+        part = self._clear(wanted, body, fields, driver, arm)
+        if not aside_mps:
+            return part
+        return part._replace(speed_mps=part.speed_mps * cos(heading), aside_mps=part.speed_mps * sin(heading))
 
-    def _backwards(self, wanted: Allowed, body: Pose2, around: Surroundings, driver: Driver) -> Allowed:
+    def _backwards(self, wanted: Allowed, body: Pose2, around: Surroundings, driver: Driver, *, aside: bool) -> Allowed:
         slower = max(wanted.speed_mps, -self._config.crawl_mps)
         poses = driver.stopping_poses(slower, wanted.turn_radps)
         rim = np.array([[np.cos(np.pi + bearing), np.sin(np.pi + bearing)] for bearing in _RIM])
@@ -106,8 +125,10 @@ class Caution:
             away_m = np.linalg.norm(hidden[:, None, :] - trail[None, :, :], axis=2).min(axis=1)
             hidden = hidden[away_m > self._body_m + 0.01]
         if len(hidden):
-            return wanted._replace(speed_mps=0.0, why="the floor behind was never seen: turn round to drive there")
-        return wanted._replace(speed_mps=slower, why="" if slower == wanted.speed_mps else "slowly backwards")
+            where, how = ("on that side", "turn there") if aside else ("behind", "turn round")
+            return wanted._replace(speed_mps=0.0, why=f"the floor {where} was never seen: {how} to drive there")
+        slowly = "slowly, where the camera does not look" if aside else "slowly backwards"
+        return wanted._replace(speed_mps=slower, why="" if slower == wanted.speed_mps else slowly)
 
     def _ahead(
         self, wanted: Allowed, body: Pose2, around: Surroundings, driver: Driver, now_ns: int, *, looks: bool

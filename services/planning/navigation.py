@@ -60,17 +60,18 @@ class Driver:
         self._turns_with: WheelDrive = self._drive
         self._speed_mps = 0.0
         self._turn_radps = 0.0
+        self._aside_mps = 0.0
 
     def turn_with(self, separation_m: float | None) -> None:
         """Use a learned distance of the two wheels of a differential base; None is the nominal one."""
         self._turns_with = self._drive if separation_m is None else Differential(separation_m)
 
     def reset(self) -> None:
-        self._speed_mps = self._turn_radps = 0.0
+        self._speed_mps = self._turn_radps = self._aside_mps = 0.0
 
     @property
     def moving(self) -> bool:
-        return abs(self._speed_mps) > 1e-3 or abs(self._turn_radps) > 1e-3
+        return max(abs(self._speed_mps), abs(self._turn_radps), abs(self._aside_mps)) > 1e-3
 
     @property
     def coast_m(self) -> float:
@@ -134,18 +135,19 @@ class Driver:
         braking = _BRAKING_SHARE / self._config.acceleration_mps2
         return (sqrt(_REACTION_S**2 + 4 * braking * max(way_m, 0.0)) - _REACTION_S) / (2 * braking)
 
-    def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, pace: float = 1.0) -> BaseCommand:
-        """Approach a speed and turn rate within the acceleration limits. `pace` is the share of the limits that is used
-        to go faster and to turn; to go slower, all of them are. When a wheel saturates, all wheels are scaled, which
-        keeps the arc."""
+    def command(
+        self, speed_mps: float, turn_radps: float, dt_s: float, *, pace: float = 1.0, aside_mps: float = 0.0
+    ) -> BaseCommand:
+        """Approach a speed, turn rate and speed aside within the acceleration limits. `pace` is the share of the limits
+        that is used to go faster and to turn; to go slower, all of them are. When a wheel saturates, all wheels are
+        scaled, which keeps the arc."""
         config = self._config
-        faster = abs(speed_mps) > abs(self._speed_mps) and speed_mps * self._speed_mps >= 0
-        most = config.acceleration_mps2 * (pace if faster else 1.0)
-        self._speed_mps = _approach(self._speed_mps, speed_mps, most * dt_s)
+        self._speed_mps = self._nearer(self._speed_mps, speed_mps, dt_s, pace)
+        self._aside_mps = self._nearer(self._aside_mps, aside_mps, dt_s, pace)
         limit = pace * config.max_turn_radps
         turn_radps = min(max(turn_radps, -limit), limit)
         self._turn_radps = _approach(self._turn_radps, turn_radps, pace * config.turn_acceleration_radps2 * dt_s)
-        wheels_mps = self._turns_with.wheels(Twist(self._speed_mps, self._turn_radps))
+        wheels_mps = self._turns_with.wheels(self._twist)
         excess = max(abs(speed_mps) for speed_mps in wheels_mps) / self._base.max_wheel_speed_mps
         if excess > 1.0:
             wheels_mps = tuple(speed_mps / excess for speed_mps in wheels_mps)
@@ -157,18 +159,20 @@ class Driver:
         if fastest_mps <= limit_mps:
             return command
         share = limit_mps / fastest_mps
-        self._speed_mps *= share
-        self._turn_radps *= share
-        return BaseCommand(ahead_mps=share * command.ahead_mps, turn_radps=share * command.turn_radps)
+        self._scale(share)
+        return BaseCommand(
+            ahead_mps=share * command.ahead_mps,
+            turn_radps=share * command.turn_radps,
+            aside_mps=share * command.aside_mps,
+        )
 
     def pause(self, dt_s: float) -> BaseCommand:
         """A zero command while a publisher is late. The next command continues from the speed that the base's own
         ramp has left."""
-        fastest_mps = self._turns_with.fastest(Twist(self._speed_mps, self._turn_radps))
+        fastest_mps = self._turns_with.fastest(self._twist)
         rest_mps = max(fastest_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
         share = rest_mps / fastest_mps if fastest_mps > 0.0 else 0.0
-        self._speed_mps *= share
-        self._turn_radps *= share
+        self._scale(share)
         return BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
     def halt(self) -> BaseCommand:
@@ -178,6 +182,20 @@ class Driver:
 
     def brake(self, dt_s: float) -> BaseCommand:
         return self.command(0.0, 0.0, dt_s)
+
+    @property
+    def _twist(self) -> Twist:
+        return Twist(self._speed_mps, self._turn_radps, self._aside_mps)
+
+    def _nearer(self, now_mps: float, wanted_mps: float, dt_s: float, pace: float) -> float:
+        faster = abs(wanted_mps) > abs(now_mps) and wanted_mps * now_mps >= 0
+        most_mps2 = self._config.acceleration_mps2 * (pace if faster else 1.0)
+        return _approach(now_mps, wanted_mps, most_mps2 * dt_s)
+
+    def _scale(self, share: float) -> None:
+        self._speed_mps *= share
+        self._turn_radps *= share
+        self._aside_mps *= share
 
 
 def _approach(value: float, goal: float, step: float) -> float:

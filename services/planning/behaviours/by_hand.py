@@ -103,14 +103,22 @@ class DrivingByHand:
         arm = self._hull(snapshot)
         most_mps = config.navigation.max_speed_mps if arm is None else config.by_hand.arm_out_mps
         turn = limited(motion.turn_radps, config.navigation.max_turn_radps)
+        speed_mps, aside_mps = limited(motion.speed_mps, most_mps), 0.0
+        if motion.aside_mps and actuators.robot.drive.goes_aside:
+            share = min(most_mps / hypot(motion.speed_mps, motion.aside_mps), 1.0)
+            speed_mps, aside_mps = share * motion.speed_mps, share * motion.aside_mps
         allowed = caution.allow(
-            limited(motion.speed_mps, most_mps), turn, snapshot.body, estimator.around, fields, driver,
-            snapshot.now_ns, arm=arm, looks=self._head.free(snapshot),
+            speed_mps, turn, snapshot.body, estimator.around, fields, driver,
+            snapshot.now_ns, arm=arm, looks=self._head.free(snapshot), aside_mps=aside_mps,
         )  # fmt: skip
-        if self._bumped and motion.speed_mps > 0.0:
-            allowed = allowed._replace(speed_mps=0.0, why="the bumper touches something: back off")
+        if motion.aside_mps and not aside_mps:
+            allowed = allowed._replace(why="; ".join(filter(None, ("this base cannot move aside", allowed.why))))
+        if self._bumped and (speed_mps > 0.0 or aside_mps):
+            allowed = allowed._replace(speed_mps=0.0, aside_mps=0.0, why="the bumper touches something: back off")
         pace = 1.0 if arm is None else GENTLE
-        command = driver.command(allowed.speed_mps, allowed.turn_radps, snapshot.dt_s, pace=pace)
+        command = driver.command(
+            allowed.speed_mps, allowed.turn_radps, snapshot.dt_s, pace=pace, aside_mps=allowed.aside_mps
+        )
         # As `PlanningCore.slow_down` does for behaviours that need sight all the time.
         who, age_s = estimator.oldest(snapshot.now_ns, sight=True)
         slower = driver.within(command, actuators.robot.base.speed_at_age_mps(age_s + 1.0 / config.rate_hz))
@@ -137,6 +145,9 @@ def _what(motion: Motion, base: BaseCommand) -> str:
     """What happens, in words."""
     if motion.zero:
         return "at rest: nothing is held"
+    if motion.aside_mps:
+        ahead_mps, aside_mps = round(base.ahead_mps, 2) + 0.0, round(base.aside_mps, 2) + 0.0  # no -0.00
+        return f"driving by hand, {ahead_mps:+.2f} m/s ahead, {aside_mps:+.2f} m/s to the left"
     if motion.speed_mps:
         return f"driving by hand, {base.ahead_mps:+.2f} m/s"
     if motion.base:
