@@ -53,7 +53,8 @@ async def run(
         await node.__aenter__()
         node.ready()
     for tick in range(ticks):
-        base.publish(topics.BASE_STATE, BaseState(odometry_m=(0.0, 0.0), **{**STILL, "speed_mps": tick / 100}))
+        moving = {**STILL, "speed_mps": tick / 100, "aside_mps": tick / 200}
+        base.publish(topics.BASE_STATE, BaseState(odometry_m=(0.0, 0.0), **moving))
         for node, topic, group in zip((arm, hand), (topics.ARM_STATE, topics.HAND_STATE), GROUPS, strict=True):
             if node is hand or tick not in numb:
                 joints = ROBOT.group_joints(group)
@@ -71,7 +72,7 @@ async def run(
             goal = ServoCommand(joints=("neck_pan",), goal_rad=(0.5,), speed_radps=(0.0 if tick >= 80 else 1.0,))
             planning.publish(topics.ARM_COMMAND, goal)
         if 30 <= tick < 60:
-            planning.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.15, turn_radps=0.4))
+            planning.publish(topics.BASE_COMMAND, BaseCommand(ahead_mps=0.15, turn_radps=0.4, aside_mps=0.1))
         await asyncio.sleep(0.02)
     for node in nodes:
         await node.__aexit__(None, None, None)

@@ -55,21 +55,22 @@ class RobotRig:
         settings: Mapping[str, Mapping[str, Any]] | None = None,
         latency_s: Mapping[str, float] | None = None,
         record_steps: bool = False,
+        robot: Robot | None = None,
         name: str = "",
         mesh: LocalMesh | None = None,
         clock_of: Callable[[str], Clock] | None = None,
         bus_of: Callable[[LocalMesh, str, str], NotedBus] | None = None,
     ) -> None:
-        """`settings`: by service; frames are small unless the settings of 'sim' are given. `name` and `mesh`: for
-        several robots on one mesh. `clock_of`: returns the clock of each service, in place of virtual time.
-        `bus_of`: makes the bus of a component on a mesh, for a robot's name."""
+        """`settings`: by service; frames are small unless the settings of 'sim' are given. `robot`: None is the
+        Calliope. `name` and `mesh`: for several robots on one mesh. `clock_of`: returns the clock of each service, in
+        place of virtual time. `bus_of`: makes the bus of a component on a mesh, for a robot's name."""
         self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
         self._latency_s = latency_s or {}
         self._record_steps = record_steps
         self._clock = VirtualClock()
         self._clock_of = clock_of or (lambda _: self._clock)
         self._bus_of = bus_of or (lambda mesh, robot, _: NotedBus(mesh, robot))
-        self.robot = Robot.load()
+        self.robot = robot or Robot.load()
         self.robot.name = name or self.robot.name
         self.mesh = mesh or LocalMesh()
         self._services: dict[str, _Running] = {}

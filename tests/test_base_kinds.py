@@ -6,13 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omni_robot import OMNI, WHEELS, omni_data, omni_robot
+from omni_robot import WHEELS, omni_data, omni_robot
 
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import VirtualClock
 from cocoro.differential import Differential
 from cocoro.errors import ConfigError
 from cocoro.learning.handmap import fingerprint_of
+from cocoro.node import Node
 from cocoro.omni import Omni
 from cocoro.robot import Robot
+from services.base.service import BaseConfig, BaseService
 
 ROBOT = Robot.load()
 TEXT = Path("cocoro/calliope.toml").read_text()
@@ -31,7 +35,8 @@ def test_a_description_without_a_kind_is_of_a_differential_base() -> None:
 
 
 def test_an_omni_base_is_read_from_a_file(tmp_path: Path) -> None:
-    text = TEXT.replace("wheel_separation_m = 0.261\nwheel_radius_m = 0.030\n", 'kind = "omni"\n', 1)
+    text = TEXT.replace("wheel_separation_m = 0.261\nwheel_radius_m = 0.030\n", "", 1)
+    text = text.replace('kind = "differential"', 'kind = "omni"', 1)
     for wheel in WHEELS:
         text += f'\n[[base.wheel]]\nname = "{wheel["name"]}"\n'
         text += "".join(f"{field} = {wheel[field]}\n" for field in ("distance_m", "angle_deg", "radius_m"))
@@ -74,7 +79,12 @@ def test_a_calliope_with_omni_wheels_beside_its_own_is_refused() -> None:
     data["base"]["wheel"] = WHEELS
     with pytest.raises(ConfigError, match=r"'differential' has no \[\[base.wheel\]\]"):
         Robot.from_data(data)
-    assert "wheel" in OMNI
+
+
+def test_a_creates_service_refuses_another_base() -> None:
+    node = Node("base", LocalMesh().join(), VirtualClock(), omni_robot())
+    with pytest.raises(ConfigError, match=r"a Create has two wheels on one axle, but .* 'omni'"):
+        BaseService(node, BaseConfig())
 
 
 def test_learned_models_belong_to_the_wheels_of_their_base() -> None:

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from capture_rig import ROBOT
 from lerobot_rig import GOLDEN, JOINTS, SPEED, TURN, WHOLE, Told, angle, at, episode_of, recorded
+from omni_robot import omni_robot
 
 from apps.captures.export import lerobot
-from apps.captures.export.lerobot_episodes import NotAnEpisodeError, Recording, camera_rate_hz, recorded_tasks
+from apps.captures.export.lerobot_episodes import NotAnEpisodeError, Recording, camera_rate_hz, names_of, recorded_tasks
 from apps.captures.export.lerobot_stats import QUANTILES, PictureStats, of_values
 from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
@@ -83,6 +84,17 @@ def test_a_command_of_the_base_counts_as_long_as_it_obeys_it(fetched: Path) -> N
         moves = 30 <= tick <= valid
         assert action[row, SPEED] == pytest.approx(0.15 if moves else 0.0)
         assert action[row, TURN] == pytest.approx(0.4 if moves else 0.0)
+
+
+def test_a_base_that_can_move_aside_has_its_speed_aside_between_the_two_others(fetched: Path) -> None:
+    robot = omni_robot()
+    assert names_of(robot)[-3:] == ["x.vel", "y.vel", "theta.vel"]
+    with Tables.open(fetched) as capture:
+        episode = Recording(capture, robot).episode(recorded_tasks(capture)[0], 10)
+    ticks = range(10, 111, 5)
+    assert episode.state[:, SPEED:].tolist() == [pytest.approx([tick / 100, tick / 200, 0.0]) for tick in ticks]
+    assert episode.action[ticks.index(50), SPEED:].tolist() == pytest.approx([0.15, 0.1, 0.4])
+    assert names_of(ROBOT)[-2:] == ["x.vel", "theta.vel"]
 
 
 def test_the_pictures_of_an_episode_are_those_of_its_rows(fetched: Path) -> None:

@@ -117,3 +117,13 @@ def test_driving_to_a_place_works_on_an_omni_base_without_going_aside() -> None:
     assert planner.wheels.ahead_mps > 0.2
     assert planner.wheels.aside_mps == pytest.approx(0.0, abs=1e-9)
     assert OMNI.drive.fastest_mps(planner.wheels) <= OMNI.base.max_wheel_speed_mps + 1e-9
+
+
+def test_a_distance_of_two_wheels_is_not_learned_where_there_are_three() -> None:
+    planner = Planner(robot=OMNI)
+    planner.run(0.4)
+    planner.want("babble-wheels", "red_can", first=0, count=2)
+    status = planner.run(0.1)
+    assert (status.state, status.reason) == ("failed", "unreachable")
+    assert "no two wheels" in status.why
+    assert standing(planner)

@@ -38,10 +38,10 @@ class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class BaseService:
     def __init__(self, node: Node, config: BaseConfig) -> None:
-        self._node = node
-        self._reporter = FaultReporter(node)
         if node.robot.base.kind != "differential":
             raise ConfigError(f"a Create has two wheels on one axle, but [base] kind = {node.robot.base.kind!r}")
+        self._node = node
+        self._reporter = FaultReporter(node)
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
         robot = node.robot_name if node.latches is not None else None

@@ -32,8 +32,9 @@ from cocoro.topics import (
 
 STATES, COMMANDS = (ARM_STATE, HAND_STATE), (ARM_COMMAND, HAND_COMMAND)
 BASE_NAMES = ("x.vel", "theta.vel")
-"""Speed ahead, m/s, and turn rate, rad/s, counter-clockwise; the names of LeRobot's own mobile robot. Odometry has no
-speed aside, so neither state nor action have one."""
+"""Speed ahead, m/s, and turn rate, rad/s, counter-clockwise; the names of LeRobot's own mobile robot."""
+ASIDE_NAME = "y.vel"
+"""Speed to the left, m/s, between the two, of a base that can move aside."""
 LONGEST_GAP_NS = round(FRAME.max_age_s * NS)
 """A task whose pictures or states have a longer gap is no episode: nothing in the robot acts on an older picture."""
 
@@ -65,9 +66,10 @@ class Episode(NamedTuple):
     pictures_ns: IntArray
     """Stamp of each row's picture, shape (rows,)."""
     state: Float32Array
-    """Joint angles, rad, in the description's order, then speed and turn rate by odometry, shape (rows, joints + 2)."""
+    """Joint angles, rad, in the description's order, then the base's speeds by odometry, shape (rows, joints + 2), or
+    + 3 for a base that can move aside."""
     action: Float32Array
-    """Joint goals, rad, then the commanded speed and turn rate, shape (rows, joints + 2)."""
+    """Joint goals, rad, then the commanded speeds, in the same shape."""
 
     @property
     def rows(self) -> int:
@@ -76,7 +78,9 @@ class Episode(NamedTuple):
 
 def names_of(robot: Robot) -> list[str]:
     """Names of the values of state and action."""
-    return [*(f"{joint}.pos" for joint in robot.joints), *BASE_NAMES]
+    ahead, turn = BASE_NAMES
+    aside = [ASIDE_NAME] if robot.drive.goes_aside else []
+    return [*(f"{joint}.pos" for joint in robot.joints), ahead, *aside, turn]
 
 
 def recorded_tasks(capture: Tables) -> list[RecordedTask]:
@@ -121,10 +125,11 @@ class Recording:
                 raise NotAnEpisodeError(f"it has no state of the joint {joint}")
         self._goals = _by_joint(capture, [topic.name for topic in COMMANDS], "goal_rad", "speed_radps")
         self._joints = [*robot.joints]
-        self._odometry = _series(capture, BASE_STATE.name, "speed_mps", "turn_rate_radps")
+        aside = ["aside_mps"] if robot.drive.goes_aside else []
+        self._odometry = _series(capture, BASE_STATE.name, "speed_mps", *aside, "turn_rate_radps")
         if not len(self._odometry.stamps_ns):
             raise NotAnEpisodeError("it has no state of the base")
-        self._commanded = _series(capture, BASE_COMMAND.name, "ahead_mps", "turn_radps")
+        self._commanded = _series(capture, BASE_COMMAND.name, "ahead_mps", *aside, "turn_radps")
         self._command_ns = round(robot.base.command_timeout_s * NS)
 
     def episode(self, task: RecordedTask, rate_hz: int) -> Episode:
