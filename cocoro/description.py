@@ -17,6 +17,7 @@ from msgspec import Meta
 from cocoro.base import Base
 from cocoro.errors import ConfigError
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
+from cocoro.link_row import LinkRow
 from cocoro.units import Positive, Vec3
 
 OWN_FILE = "calliope.toml"
@@ -159,17 +160,6 @@ class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     touching: list[tuple[str, str]] = []
     """Links that touch though no joint is between them: they do not collide. A part of the body is its own link, and
     `mount` is the mount."""
-
-
-class LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    parent: str
-    theta_deg: float
-    d_m: float
-    alpha_deg: float
-    r_m: float
-    joint: str | None = None
-    offset_deg: float = 0.0
 
 
 class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -12,26 +12,23 @@ from math import cos, sin
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.units import Vec3
 
 _HERE = np.eye(4)
 _HERE.setflags(write=False)
 
 
 @dataclass(frozen=True)
-class Link:
-    """One row of the kinematic table: Rz(theta) Tz(d) Tx(r) Rx(alpha), then Rz(joint angle + offset)."""
+class DenavitHartenberg:
+    """A place in the parent's frame: Rz(theta) Tz(d) Tx(r) Rx(alpha)."""
 
-    name: str
-    parent: str
-    joint: str | None
     theta_rad: float
     d_m: float
     alpha_rad: float
     r_m: float
-    offset_rad: float
 
-    def fixed(self) -> FloatArray:
-        """Transform (4, 4), metres, from the link's frame to its parent's before the joint's own turn."""
+    def transform(self) -> FloatArray:
+        """Transform (4, 4), metres, to the parent's frame."""
         ct, st = cos(self.theta_rad), sin(self.theta_rad)
         ca, sa = cos(self.alpha_rad), sin(self.alpha_rad)
         return np.array(
@@ -42,6 +39,42 @@ class Link:
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A place in the parent's frame, as a URDF has it: T(xyz) Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    xyz_m: Vec3
+    rpy_rad: Vec3
+
+    def transform(self) -> FloatArray:
+        """Transform (4, 4), metres, to the parent's frame."""
+        (x, y, z), (roll, pitch, yaw) = self.xyz_m, self.rpy_rad
+        cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
+        return np.array(
+            [
+                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
+                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
+                [-sp, cp * sr, cp * cr, z],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class Link:
+    """One row of the kinematic table: its place in the parent's frame, then Rz(joint angle + offset)."""
+
+    name: str
+    parent: str
+    joint: str | None
+    place: DenavitHartenberg | Origin
+    offset_rad: float = 0.0
+
+    def fixed(self) -> FloatArray:
+        """Transform (4, 4), metres, from the link's frame to its parent's before the joint's own turn."""
+        return self.place.transform()
 
 
 def turn_z(angle_rad: float) -> FloatArray:

@@ -10,12 +10,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
 from cocoro.description import Description, completed, read
 from cocoro.errors import ConfigError, field_text
 from cocoro.joints import GROUPS, Group, Joint, Network
-from cocoro.kinematics import Chain, Link, Tree
+from cocoro.kinematics import Chain, DenavitHartenberg, Link, Origin, Tree
+from cocoro.link_row import LinkRow
 
 
 @dataclass(frozen=True)
@@ -68,16 +70,7 @@ class Robot:
             row.name: Joint.of(row, spec.network[row.network].protocol, groups.get(row.name)) for row in spec.joint
         }
         self.links = {
-            row.name: Link(
-                row.name,
-                row.parent,
-                row.joint,
-                radians(row.theta_deg),
-                row.d_m,
-                radians(row.alpha_deg),
-                row.r_m,
-                radians(row.offset_deg),
-            )
+            row.name: Link(row.name, row.parent, row.joint, _place_of(row), radians(row.offset_deg))
             for row in spec.link
         }
 
@@ -195,3 +188,14 @@ class Robot:
         table[2047] = np.nan
         table[table > 2 * self.kinect.max_range_m] = np.nan
         return table.astype(np.float32)
+
+
+def _place_of(row: LinkRow) -> DenavitHartenberg | Origin:
+    if row.xyz_m is not UNSET and row.rpy_deg is not UNSET:
+        roll, pitch, yaw = row.rpy_deg
+        return Origin(row.xyz_m, (radians(roll), radians(pitch), radians(yaw)))
+    assert row.theta_deg is not UNSET
+    assert row.d_m is not UNSET
+    assert row.alpha_deg is not UNSET
+    assert row.r_m is not UNSET
+    return DenavitHartenberg(radians(row.theta_deg), row.d_m, radians(row.alpha_deg), row.r_m)

@@ -122,9 +122,7 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     arm_links = [robot.link_of(joint) for joint in (*robot.arm.joints, robot.arm.roll)]
     head_links = [robot.link_of(joint) for joint in (robot.head.pan, robot.head.tilt)]
     for name in arm_links:
-        for length in ("d_m", "r_m"):
-            if rows[name][length] != 0.0:
-                rows[name][length] += float(rng.uniform(-LENGTH_M, LENGTH_M))
+        _stretch(rows[name], rng)
     for name in head_links + arm_links:
         rows[name]["offset_deg"] += float(rng.uniform(-ZERO_DEG, ZERO_DEG))
     shift_m = _direction(rng) * rng.uniform(0.0, CAMERA_M)
@@ -142,6 +140,17 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     for wheel in data["base"]["wheel"]:
         wheel["distance_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M)) / 2
     return Robot.from_data(data, "worn body")
+
+
+def _stretch(row: dict[str, Any], rng: np.random.Generator) -> None:
+    """Changes the lengths of a link's row that are not 0, whichever form it has."""
+    if "xyz_m" in row:
+        lengths = [value + float(rng.uniform(-LENGTH_M, LENGTH_M)) if value != 0.0 else 0.0 for value in row["xyz_m"]]
+        row["xyz_m"] = tuple(lengths)
+        return
+    for length in ("d_m", "r_m"):
+        if row[length] != 0.0:
+            row[length] += float(rng.uniform(-LENGTH_M, LENGTH_M))
 
 
 def _direction(rng: np.random.Generator) -> FloatArray:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cocoro.arrays import FloatArray
-from cocoro.kinematics import Chain, Link, turn_z
+from cocoro.kinematics import Chain, DenavitHartenberg, Link, Origin, turn_z
 from cocoro.robot import Robot
 
 ROBOT = Robot.load()
@@ -35,8 +35,19 @@ def shift(x: float, z: float) -> FloatArray:
 def test_a_row_turns_about_z_goes_along_z_goes_along_x_and_turns_about_x(
     theta: float, d: float, alpha: float, r: float
 ) -> None:
-    link = Link("link", "body", None, theta, d, alpha, r, 0.0)
+    link = Link("link", "body", None, DenavitHartenberg(theta, d, alpha, r))
     assert link.fixed() == pytest.approx(turn_z(theta) @ shift(0, d) @ shift(r, 0) @ turn_x(alpha), abs=1e-12)
+
+
+@given(xyz=st.tuples(*[st.floats(-1, 1)] * 3), rpy=st.tuples(angle, angle, angle))
+def test_a_row_as_in_a_urdf_goes_to_its_origin_and_rolls_pitches_and_yaws_about_fixed_axes(
+    xyz: tuple[float, float, float], rpy: tuple[float, float, float]
+) -> None:
+    roll, pitch, yaw = rpy
+    about_y = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=float)  # x to y, y to z
+    expected = turn_z(yaw) @ about_y @ turn_x(pitch) @ about_y.T @ turn_x(roll)
+    expected[:3, 3] = xyz
+    assert Link("link", "body", None, Origin(xyz, rpy)).fixed() == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +120,7 @@ def test_the_hands_roll_turns_about_the_hand() -> None:
     assert chain.position(ZERO | {"wrist_roll": pi / 2}) == pytest.approx(chain.position(ZERO), abs=1e-9)
 
 
-@pytest.mark.parametrize("links", [{}, {"tip": Link("tip", "elsewhere", None, 0, 0, 0, 0, 0)}])
+@pytest.mark.parametrize("links", [{}, {"tip": Link("tip", "elsewhere", None, Origin((0, 0, 0), (0, 0, 0)))}])
 def test_a_link_that_is_not_described_is_named(links: dict[str, Link]) -> None:
     with pytest.raises(KeyError, match="tip" if not links else "elsewhere"):
         Chain(links, "tip")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import acos, degrees
+from math import acos, degrees, hypot
 
 import numpy as np
 import pytest
@@ -34,8 +34,9 @@ def test_lengths_zeros_marker_and_wheels_stay_within_their_bounds(robot: Robot) 
         worn = body_of(robot, "worn", seed).robot
         for name, drawn in robot.links.items():
             real = worn.links[name]
-            assert abs(real.r_m - drawn.r_m) <= 0.005
-            assert abs(real.d_m - drawn.d_m) <= 0.005
+            x, y, z = (real.fixed() - drawn.fixed())[:3, 3]
+            assert hypot(x, y) <= 0.005
+            assert abs(z) <= 0.005
             assert abs(degrees(real.offset_rad - drawn.offset_rad)) <= 2.0
         off = np.subtract(worn.marker.position_m, robot.marker.position_m)
         assert np.linalg.norm(off) == pytest.approx(0.005)
