@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from math import cos, sin
+from math import atan2, cos, hypot, sin
 
 import numpy as np
 
@@ -47,6 +47,16 @@ class Origin:
 
     xyz_m: Vec3
     rpy_rad: Vec3
+
+    @classmethod
+    def of(cls, transform: FloatArray) -> Origin:
+        """The origin of a transform (4, 4), metres. At a pitch of a right angle yaw is 0."""
+        turn, (x, y, z) = transform[:3, :3].tolist(), transform[:3, 3].tolist()
+        level = hypot(turn[0][0], turn[1][0])
+        pitch = atan2(-turn[2][0], level)
+        if level < 1e-9:
+            return cls((x, y, z), (atan2(-turn[1][2], turn[1][1]), pitch, 0.0))
+        return cls((x, y, z), (atan2(turn[2][1], turn[2][2]), pitch, atan2(turn[1][0], turn[0][0])))
 
     def transform(self) -> FloatArray:
         """Transform (4, 4), metres, to the parent's frame."""

@@ -49,6 +49,7 @@ ARGUMENTS: dict[str, str] = {
     "capture latency": "{capture}",
     "new service": "nearest --into {name}",
     "new task": "greet --into {name}",
+    "new robot": "ada --urdf {urdf} --into {name}",
     "pki init": "--site {name}",
     "pki issue": "robot base --site {name}",
     "pki renew": "base --site {name}",
@@ -169,11 +170,13 @@ class Table:
         name = f"{surroundings.odd}x"
         (folder / f"{name}_capture.mcap").symlink_to(self._root / "capture.mcap")
         (folder / f"{name}_picture.png").symlink_to(self._root / "picture.png")
+        (folder / f"{name}_arm.urdf").symlink_to(self._root / "desk.urdf")
         words = {
             "name": name,
             "capture": str(folder / f"{name}_capture.mcap"),
             "golden": str(GOLDEN),
             "picture": str(folder / f"{name}_picture.png"),
+            "urdf": str(folder / f"{name}_arm.urdf"),
         }
         what = dict(surroundings.what)
         run = Path(tempfile.mkdtemp(dir=self._root))

@@ -23,6 +23,7 @@ import pytest
 from cli_forks import FULL, NO_MOUNTS, TALKED, Forks
 from cli_surroundings import ARGUMENTS, COMMANDS, GOLDEN, NOT_UTF8, SURROUNDINGS, Surroundings, Table, wrong
 from places import in_short_folder
+from urdf_rig import desk_arm
 
 from apps.captures.rewrite import rewrite
 from apps.cli import exits
@@ -40,6 +41,7 @@ def root() -> Iterator[Path]:
         picture = np.full((60, 80, 3), 200, np.uint8)
         cv2.rectangle(picture, (30, 20), (50, 40), (20, 120, 240), cv2.FILLED)
         assert cv2.imwrite(str(path / "picture.png"), picture)
+        desk_arm(path)
         with Capture.open(GOLDEN) as capture:
             rewrite(capture, path / "capture.mcap", Packer("zstd"), end_ns=capture.start_ns + NS // 5)
         yield path
@@ -100,7 +102,7 @@ def test_so_it_does_in_the_locale_of_c(table: Table, root: Path) -> None:
 def test_all_is_well_where_nothing_is_wrong(table: Table) -> None:
     """The table is not one of commands that all fail alike."""
     well = {command for command in COMMANDS if table.usual(command).code == exits.DONE}
-    writers = {"export", "capture info", "capture repair", "new service", "topics", "down"}
+    writers = {"export", "capture info", "capture repair", "new service", "new robot", "topics", "down"}
     assert well >= writers, [table.usual(command) for command in writers - well]
     assert all(not table.usual(command).err or table.usual(command).code for command in writers)
 
@@ -210,6 +212,7 @@ WRITERS = {
     "export": ("{golden} --video {name}.mp4", "{capture} --foxglove {name}.mcap", "{capture} --csv {name}"),
     "capture repair": ("{capture} --out {name}.mcap",),
     "new service": ("nearest --into {name}",),
+    "new robot": ("ada --urdf {urdf} --into {name}",),
     "pki init": ("--site {name}",),
     "objects learn": ("mug --from {picture} --size 0.08x0.1 --catalogue {name}.toml --picture {name}.png --yes",),
 }

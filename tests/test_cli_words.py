@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from places import in_short_folder
+from urdf_rig import desk_arm
 
 from apps.cli import manual
 from apps.cli.listening import nothing_on
@@ -100,6 +101,7 @@ def test_an_error_is_one_object_on_standard_output_where_json_is_asked_for(
         (["down"], {"down"}),
         (["new", "service", "greeter"], {"files", "next"}),
         (["new", "task", "greet"], {"files", "next"}),
+        (["new", "robot", "ada", "--urdf", "desk.urdf"], {"files", "next"}),
         (["doctor", "sim"], None),
         (["topics"], None),
         (["capture", "list"], None),
@@ -114,6 +116,7 @@ def test_a_result_is_one_document_of_json(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path))
+    desk_arm(tmp_path)
     main([*arguments, "--json"])
     result = json.loads(capsys.readouterr().out)
     assert isinstance(result, list) if keys is None else result.keys() == keys

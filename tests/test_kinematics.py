@@ -50,6 +50,14 @@ def test_a_row_as_in_a_urdf_goes_to_its_origin_and_rolls_pitches_and_yaws_about_
     assert Link("link", "body", None, Origin(xyz, rpy)).fixed() == pytest.approx(expected, abs=1e-12)
 
 
+@given(xyz=st.tuples(*[st.floats(-1, 1)] * 3), rpy=st.tuples(angle, st.sampled_from([0.3, pi / 2, -pi / 2]), angle))
+def test_the_origin_of_a_transform_is_the_same_place(
+    xyz: tuple[float, float, float], rpy: tuple[float, float, float]
+) -> None:
+    place = Origin(xyz, rpy).transform()
+    assert Origin.of(place).transform() == pytest.approx(place, abs=1e-8)
+
+
 @pytest.mark.parametrize(
     ("tip", "place_mm"),
     [

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from math import asin, atan2, degrees
+from math import degrees
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Tree
+from cocoro.kinematics import Origin, Tree
 from cocoro.learning.handmap import NominalModel, fingerprint_of
 from cocoro.link_row import DENAVIT_HARTENBERG
 from cocoro.robot import Robot
@@ -21,14 +20,6 @@ from sim.realism import body_of
 ROBOT = Robot.load()
 
 
-def rpy_deg(turn: FloatArray) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a rotation matrix; its pitch may be a right angle."""
-    pitch = asin(max(-1.0, min(1.0, -turn[2, 0])))
-    if abs(turn[2, 0]) > 1.0 - 1e-9:
-        return degrees(atan2(-turn[1, 2], turn[1, 1])), degrees(pitch), 0.0
-    return degrees(atan2(turn[2, 1], turn[2, 2])), degrees(pitch), degrees(atan2(turn[1, 0], turn[0, 0]))
-
-
 def by_origins() -> dict[str, Any]:
     """The Calliope with each row in the other form."""
     data = ROBOT.to_data()
@@ -36,7 +27,8 @@ def by_origins() -> dict[str, Any]:
         fixed = ROBOT.links[row["name"]].fixed()
         for field in DENAVIT_HARTENBERG:
             del row[field]
-        row |= {"xyz_m": tuple(fixed[:3, 3].tolist()), "rpy_deg": rpy_deg(fixed[:3, :3])}
+        place = Origin.of(fixed)
+        row |= {"xyz_m": place.xyz_m, "rpy_deg": tuple(degrees(angle) for angle in place.rpy_rad)}
     return data
 
 

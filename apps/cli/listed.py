@@ -44,7 +44,7 @@ _SUMMARIES = {
         "cockpit": "Let persons into the cockpit from other machines; list them, end it.",
         "site": "Check the plan of several machines; show it, its steps and its rules.",
         "pki": "Issue, renew and revoke the certificates of a site; list them.",
-        "new": "Write a component (`new service NAME`) or a task (`new task NAME`) from a template.",
+        "new": "Write a component (`new service NAME`), a task (`new task NAME`) or a robot (`new robot NAME`).",
     },
     HARDWARE: {
         "base": "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode.",

@@ -1,4 +1,5 @@
-"""`cocoro new service NAME` and `cocoro new task NAME`: write a distribution with a working component or task."""
+"""`cocoro new service NAME` and `cocoro new task NAME`: write a distribution with a working component or task; and
+`cocoro new robot NAME`, whose files `apps.cli.new_robot` writes."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import importlib.util
 import keyword
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
@@ -16,22 +17,20 @@ import typer
 
 from apps.cli import exits
 from apps.cli.listed import COMMANDS
+from apps.cli.new_files import check_name, free_folder, put, tell_of
 from apps.cli.options import JsonOption
-from apps.cli.output import print_json
 from cocoro.errors import ConfigError
 from deploy import processes
 from services.executive.tasks import TASKS
 
 SERVICE, TASK = "templates/service", "templates/task"
 SUFFIX = ".template"
-NAME = r"[a-z][a-z0-9_-]{0,31}"
-"""Valid names: a chunk of a key, and with '_' for '-' a Python package."""
 
 
 app = typer.Typer()
 new = typer.Typer(
     no_args_is_help=True,
-    help="Write a component (`new service NAME`) or a task (`new task NAME`) from a template.",
+    help="Write a component (`new service NAME`), a task (`new task NAME`) or a robot (`new robot NAME`).",
 )
 app.add_typer(new, name="new")
 
@@ -56,11 +55,22 @@ def task(
     sys.exit(write_task(name, into, json))
 
 
+@new.command()
+def robot(
+    name: Annotated[str, typer.Argument(help="Name of the robot, the first part of all its keys: ada.")],
+    urdf: Annotated[Path, typer.Option("--urdf", metavar="FILE", help="The robot's URDF, its meshes beside it.")],
+    into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+    json: JsonOption = False,
+) -> None:
+    """A description and a profile from a URDF, which run in the simulator, and a page of what is missing."""
+    from apps.cli.new_robot import write_robot  # imports the simulator's body
+
+    sys.exit(write_robot(name, urdf, into, json))
+
+
 def write_service(name: str, into: Path, as_json: bool = False) -> int:
     """Writes the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
-    folder = into / name
-    if folder.exists():
-        raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
+    folder = free_folder(name, into)
     package = package_of(name)
     made = write(SERVICE, name, folder)
     hints = (
@@ -75,9 +85,7 @@ def write_service(name: str, into: Path, as_json: bool = False) -> int:
 
 def write_task(name: str, into: Path, as_json: bool = False) -> int:
     """Writes the task into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
-    folder = into / name
-    if folder.exists():
-        raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
+    folder = free_folder(name, into)
     package = package_of(name)
     if name in TASKS.all():
         raise ConfigError(f"there is a task {name} already; choose another name")
@@ -102,32 +110,14 @@ def write(template: str, name: str, folder: Path) -> list[Path]:
     }
     made = []
     for path, text in files(template, words):
-        target = folder / path
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
-        made.append(target)
+        put(folder / path, text)
+        made.append(folder / path)
     return made
-
-
-def tell_of(made: list[Path], where: str, hints: Iterable[tuple[str, str]], as_json: bool) -> None:
-    """Prints the new files, where to begin, and what to do next."""
-    if as_json:
-        print_json({"files": [str(path) for path in made], "next": [command for command, _ in hints]})
-        return
-    print(*made, f"\n{where} Next:", sep="\n")
-    hints = tuple(hints)
-    width = max(len(command) for command, _ in hints)
-    for command, what in hints:
-        print(f"  {command:<{width}}  # {what}")
 
 
 def package_of(name: str) -> str:
     """The Python package of a component or task. Raises ConfigError for a name that is not valid or is taken."""
-    if not re.fullmatch(NAME, name):
-        raise ConfigError(f"{name!r} is not a valid name: small letters, digits, '_' and '-', a letter first")
+    check_name(name)
     package = name.replace("-", "_")
     for row in processes.table().values():
         if name in (row.name, *row.services):

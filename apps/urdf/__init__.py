@@ -1,0 +1,1 @@
+"""A robot description from a URDF: reading, conversion, and what a URDF does not say."""

@@ -1,0 +1,165 @@
+"""What a URDF does not say, or what this one does not: for the page beside the description."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from apps.urdf.assumed import LIMITS_DEG, SPEED_RADPS, TORQUE_NM, Body
+from apps.urdf.hand import Hand
+from apps.urdf.model import Urdf
+from apps.urdf.parts import ASSUMED_MASS_KG, Parts
+from apps.urdf.roles import Roles
+
+NEVER, GUESSED, FILE = "What no URDF says", "Guessed from order and names", "What this file lacks"
+
+
+class Missing(NamedTuple):
+    """One thing that is missing, and what stands in its place."""
+
+    section: str
+    what: str
+    where: str
+    """Table and field of the description."""
+    now: str
+    """What stands there."""
+    otherwise: str
+    """What happens as long as it stands there."""
+
+
+def missing_of(
+    urdf: Urdf, roles: Roles, hand: Hand, parts: Parts, body: Body, data: dict[str, Any]
+) -> tuple[Missing, ...]:
+    return (
+        *_never(urdf, roles, body, data),
+        *_guessed(roles, hand, data),
+        *_lacking(urdf, roles, parts),
+    )
+
+
+def _never(urdf: Urdf, roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
+    base, x_y_z = data["base"], [round(value, 3) for value in body.root.xyz_m]
+    wheels = (
+        f" The URDF has the wheels {', '.join(roles.wheels)}: in the simulator they are rigid." if roles.wheels else ""
+    )
+    return [
+        Missing(
+            NEVER, "kind, wheels and limits of the base", "`[base]`",
+            f"a differential base, {base['chassis_diameter_m']:g} m wide, its wheels {base['wheel_separation_m']:g} m"
+            f" apart, at most {base['max_wheel_speed_mps']:g} m/s.{wheels}",
+            "it drives in the simulator; a real one drives other distances than were asked for",
+        ),
+        Missing(
+            NEVER, "where the URDF's root is in the body's frame (on the floor, x ahead, z up, amid the wheels)",
+            f"`[[link]]` {data['link'][0]['name']}, and the parts of the link `body`", f"{x_y_z} m, not turned",
+            "every place that the arm reaches is shifted or turned",
+        ),
+        Missing(
+            NEVER, "time for which a command counts, time to stand still, acceleration", "`[base]`, `[network.*]`",
+            "the Calliope's", "the emergency stop keeps its times only if the base can brake so hard",
+        ),
+        Missing(
+            NEVER, "protocol and speed of the servo lines", "`[network.*]`", "`dynamixel`, 1 Mbaud",
+            "servos of another protocol do not answer",
+        ),
+        Missing(
+            NEVER, "lines and IDs of the servos", "`[[joint]]` network, id", "IDs counted up in the URDF's order",
+            "an order goes to another joint: set them before the servos have power",
+        ),
+        Missing(
+            NEVER, "direction and zero of each servo", "`[[joint]]` direction, centre_count",
+            "1, and the middle of the servo's range",
+            "a joint turns the wrong way, or its angles are off; `cocoro servos calibrate` measures zeros",
+        ),
+        Missing(
+            NEVER, "picture size, field of view and depth of the camera", "`[kinect]`", "a Kinect's",
+            "what it sees is taken to be elsewhere",
+        ),
+        Missing(
+            NEVER, "postures: folded away, unfolded, hand in front", "`[pose.*]`",
+            "all joints at 0 or amid their limits; parked, turned to a side",
+            "the arm may strike itself on its way: set them before it moves",
+        ),
+        Missing(
+            NEVER, "space that arm and hand take up, for keeping them clear", "`[hull]`",
+            "balls of 30 mm along the arm from joint to joint", "thicker links touch what the planner keeps clear of",
+        ),
+        Missing(
+            NEVER, "fingers: length, gap, thickness of their pads", "`[claw]`, `[hull] finger_turn_deg`",
+            "pads that reach from the jaws' axes to the tip", "the simulated hand grips elsewhere than the real one",
+        ),
+        Missing(
+            NEVER, "the ball on the hand that learning looks at", "`[marker]`", "a ball 40 mm beside the roll's axis",
+            "babbling does not find the hand",
+        ),
+    ]  # fmt: skip
+
+
+def _guessed(roles: Roles, hand: Hand, data: dict[str, Any]) -> list[Missing]:
+    arm = data["arm"]
+    limb = f"{', '.join(arm['joints'])}; bend {arm['bend']}, roll {arm['roll']}"
+    rows = [
+        Missing(
+            GUESSED, "what the arm's joints are for", "`[arm]`", limb,
+            "reaching needs the first to turn about the vertical and the roll about the hand's own axis",
+        ),
+        Missing(
+            GUESSED, "the point that goes to a target's centre", "`[arm] tip`",
+            f"the link {arm['tip']}" + ("" if hand.tip else ", added: no link of the URDF has z along the hand"),
+            "the hand closes beside things",
+        ),
+    ]  # fmt: skip
+    if roles.jaws:
+        signs = ", ".join(f"{jaw} {'+' if sign > 0 else '-'}" for jaw, sign in data["claw"]["open_sign"].items())
+        rows.append(
+            Missing(GUESSED, "the way in which the jaws open", "`[claw] open_sign`", signs, "it closes to open")
+        )
+    camera = roles.camera or f"{data['kinect']['link']}, added on a mast: the URDF has no link of that name"
+    rows.append(
+        Missing(GUESSED, "the camera's place", "`[kinect] link`", camera, "what it sees is taken to be elsewhere")
+    )
+    if len(roles.head) != 2:
+        rows.append(
+            Missing(
+                GUESSED, "the joints that turn the camera", "`[head]`",
+                f"{data['head']['pan']} and {data['head']['tilt']}, which are added",
+                "the planner turns joints that are not there",
+            )
+        )  # fmt: skip
+    idle = [name for name in roles.joints if name not in (*roles.arm, roles.roll, *roles.jaws, *roles.head)]
+    if idle:
+        rows.append(Missing(GUESSED, "what these joints are for", "`[arm]`", ", ".join(idle), "they hold still"))
+    for doubt in roles.doubts:
+        where, _, sentence = doubt.partition(": ")
+        rows.append(Missing(GUESSED, sentence, f"`{where}`", "as it is", "reaching goes wrong"))
+    return rows
+
+
+def _lacking(urdf: Urdf, roles: Roles, parts: Parts) -> list[Missing]:
+    whys: dict[str, list[str]] = {}
+    for name, link in urdf.links.items():
+        for why, which in link.unread:
+            whys.setdefault(why, []).append(f"{name} ({which})")
+    rows = [
+        Missing(FILE, f"shapes of links ({why}): {', '.join(names)}", "`[solid] part`", "nothing", "things go through")
+        for why, names in whys.items()
+    ]
+    if parts.weightless:
+        what, now = f"mass of {', '.join(parts.weightless)}", f"{ASSUMED_MASS_KG:g} kg each"
+        rows.append(Missing(FILE, what, "`[solid] part`", now, "servos carry less or more than they will"))
+    for field, what, where, now in (
+        ("limits_rad", "limits", "limits_deg", f"{LIMITS_DEG[0]:g} to {LIMITS_DEG[1]:g} degrees"),
+        ("effort_nm", "torque", "torque_nm", f"{TORQUE_NM:g} N m"),
+        ("velocity_radps", "speed", "max_speed_radps", f"{SPEED_RADPS:g} rad/s"),
+    ):
+        if lacking := [name for name in roles.joints if not getattr(urdf.joints[name], field)]:
+            rows.append(
+                Missing(
+                    FILE, f"{what} of {', '.join(lacking)}", f"`[[joint]] {where}`", now, "the joint is asked for it"
+                )
+            )
+    given = {(urdf.joints[name].effort_nm, urdf.joints[name].velocity_radps) for name in roles.joints}
+    if len(given) == 1 and None not in (alike := given.pop()):
+        now = f"{alike[0]:g} N m and {alike[1]:g} rad/s for every joint, as of a file that was not filled in"
+        fields = "`[[joint]] torque_nm`, `max_speed_radps`"
+        rows.append(Missing(FILE, "torque and speed", fields, now, "the simulated servos are stronger or weaker"))
+    return rows
