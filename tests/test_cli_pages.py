@@ -14,7 +14,7 @@ from typer.main import get_group
 from apps.cli.app import app
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(cocoro [^`]+)`")
 THIRD_PARTY = ("nod", "rehearse nod")

@@ -85,7 +85,7 @@ def poses(path: Path, angles_rad: Mapping[str, float]) -> dict[str, FloatArray]:
         if origin is not None:
             here[:3, 3] = numbers(origin.get("xyz"))
             here[:3, :3] = Rotation.from_euler("xyz", numbers(origin.get("rpy"))).as_matrix()
-        if axis is not None:
+        if axis is not None and joint.get("type") != "fixed":
             along = numbers(axis.get("xyz"))
             turn = angles_rad[joint.get("name", "")] * along / np.linalg.norm(along)
             here[:3, :3] = here[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
