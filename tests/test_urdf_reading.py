@@ -107,6 +107,8 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         (None, "its mesh is not there"),
         (b"solid nothing\nendsolid nothing\n", "its mesh has no triangles that could be read"),
         (b"\x00" * 90, "its mesh has no triangles that could be read"),
+        (b"vertex 0 0 1e30", "its mesh has no triangles that could be read"),
+        (b"vertex 0 0 up", "its mesh has no triangles that could be read"),
     ],
 )
 def test_a_mesh_that_cannot_be_read_is_listed(tmp_path: Path, mesh: bytes | None, why: str) -> None:

@@ -44,9 +44,13 @@ def describe(path: Path, name: str) -> Made:
     for a robot without an arm."""
     urdf = read(path)
     try:
-        roles = roles_of(urdf)
+        return _described(urdf, name)
     except UrdfError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+def _described(urdf: Urdf, name: str) -> Made:
+    roles = roles_of(urdf)
     hand = hand_of(urdf, roles)
     body = body_of(urdf, roles)
     rows = Rows(urdf, body.root, roles.joints, hand.jaws)
@@ -67,7 +71,10 @@ def describe(path: Path, name: str) -> Made:
     data["hull"] = {"tube": _tubes(roles, rows, tip, data["link"]), **body.hull(roles, hand)}
     data["pose"] = _poses(roles, joints)
     data["solid"] = _solid(urdf, roles, rows, parts, head_parts)
-    robot = Robot.from_data(data, f"{path}: the description made of it")
+    try:
+        robot = Robot.from_data(data, "the description made of it")
+    except ConfigError as error:
+        raise UrdfError(str(error)) from error
     return Made(data, missing_of(urdf, roles, hand, parts, body, data), robot)
 
 

@@ -91,9 +91,9 @@ class Parts:
             row = self._rows.add(self._rows.free(f"{link}_aslant"), row, Origin.of(place))
             axes, place = np.eye(3), np.eye(4)
         name = self._rows.free(f"{link}_part")
-        part = {"name": name, "link": row, "shape": solid.shape, "size_m": [rounded(size, 6) for size in solid.size_m]}
+        part = {"name": name, "link": row, "shape": solid.shape, "size_m": [_size(size) for size in solid.size_m]}
         if solid.shape == "box":
-            part["size_m"] = [rounded(size, 6) for size in np.abs(axes) @ solid.size_m]
+            part["size_m"] = [_size(size) for size in np.abs(axes) @ solid.size_m]
         if solid.shape == "cylinder" and (axis := "xyz"[int(np.argmax(np.abs(axes[:, 2])))]) != "z":
             part["axis"] = axis
         if place[:3, 3].any():
@@ -146,6 +146,10 @@ def _half_m(solid: Solid) -> FloatArray:
         return np.array(solid.size_m) / 2
     radius = solid.size_m[0]
     return np.array((radius, radius, radius if solid.shape == "sphere" else solid.size_m[1] / 2))
+
+
+def _size(size_m: float) -> float:
+    return max(rounded(size_m, 6), 1e-6)
 
 
 def _overlap(one: FloatArray, other: FloatArray) -> bool:

@@ -21,6 +21,10 @@ from apps.urdf.shapes import solids_of
 from apps.urdf.values import UrdfError, number, origin, vector
 from cocoro.errors import ConfigError
 
+LEAST = 1e-6
+"""Torque, N m, and speed, rad/s, below which there is none."""
+ENDLESS_RAD = 100.0
+"""Limits beyond are none."""
 KINDS = (FIXED, REVOLUTE, CONTINUOUS)
 XACRO = "{http://www.ros.org/wiki/xacro}"
 
@@ -156,11 +160,19 @@ def _joint(element: Element) -> UrdfJoint:
         low, high = (number(limit, field, where) or 0.0 for field in ("lower", "upper"))
         if low > high:
             raise UrdfError(f"{where}: its limits fall, from {low:g} to {high:g} rad")
-        limits = (low, high) if low < high else None
+        limits = (low, high) if low < high and max(-low, high) < ENDLESS_RAD else None
     return UrdfJoint(
         name, kind, parent, child, place, (x / length, y / length, z / length), limits,
-        number(limit, "effort", where), number(limit, "velocity", where),
+        _positive(limit, "effort", where), _positive(limit, "velocity", where),
     )  # fmt: skip
+
+
+def _positive(limit: Element | None, name: str, where: str) -> float | None:
+    """A limit's value; None when it is not there or next to 0. Raises UrdfError for a negative one."""
+    value = number(limit, name, where)
+    if value is not None and value < 0.0:
+        raise UrdfError(f"{where}: its {name} is {value:g}")
+    return value if value is not None and value > LEAST else None
 
 
 def _end(element: Element, tag: str, where: str) -> str:

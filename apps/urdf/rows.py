@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from apps.urdf.model import HERE, Urdf, UrdfJoint
+from apps.urdf.values import UrdfError
 from cocoro.arrays import FloatArray
 from cocoro.kinematics import Origin
 from cocoro.units import Vec3
@@ -32,7 +33,8 @@ class Rows:
         self, urdf: Urdf, root: Origin, joints: tuple[str, ...], turns: Mapping[str, FloatArray] | None = None
     ) -> None:
         """`root`: the place of the URDF's root in the body's frame. `joints` are those that turn; others stand at 0.
-        `turns`: by joint, the frame (4, 4) in the URDF's child about whose z it turns, where the choice matters."""
+        `turns`: by joint, the frame (4, 4) in the URDF's child about whose z it turns, where the choice matters. Raises
+        UrdfError when such a joint cannot keep its name."""
         turns = turns or {}
         self.data: list[dict[str, Any]] = []
         self.taken = {BODY, CHASSIS, MOUNT, *CASTERS}
@@ -41,6 +43,8 @@ class Rows:
         self.joint: dict[str, str] = {}
         """By joint, the row that it turns."""
         for name in joints:
+            if name in turns and name in self.taken:
+                raise UrdfError(f"joint {name}: another link has that name; give it another in a copy of the file")
             if name in turns or not _about_z(urdf.joints[name]):
                 self.joint[name] = self.free(name, "axis")
         self.link[urdf.root] = self.add(self.free(urdf.root, "link"), BODY, root)

@@ -10,6 +10,8 @@ import numpy as np
 from cocoro.arrays import FloatArray
 
 _HEADER, _TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+_FARTHEST = 1e6
+"""Of a corner's coordinates, in the file's unit."""
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
 
@@ -18,7 +20,7 @@ def bounds(path: Path) -> tuple[FloatArray, FloatArray]:
     is no STL with triangles, OSError for what cannot be read."""
     data = path.read_bytes()
     corners = _binary(data) if _is_binary(data) else _text(data)
-    if not len(corners) or not np.isfinite(corners).all():
+    if not len(corners) or not np.isfinite(corners).all() or np.abs(corners).max() > _FARTHEST:
         raise ValueError("is no STL with triangles")
     return corners.min(axis=0), corners.max(axis=0)
 

@@ -9,6 +9,11 @@ from apps.urdf.model import HERE
 from cocoro.kinematics import Origin
 from cocoro.units import Vec3
 
+GREATEST = 1e20
+"""Of any value: a torque or limit that means `none` may be huge, and what is computed with it must stay finite."""
+FARTHEST = 1e4
+"""Of a value of three: a length, m, an angle, or a direction."""
+
 
 class UrdfError(Exception):
     """A file that is no URDF, or none that a description can be made of; without the file's name."""
@@ -28,7 +33,7 @@ def vector(element: Element, name: str, where: str, default: Vec3) -> Vec3:
     words = text.split()
     if len(words) != 3:
         raise UrdfError(f"{where}: {name}={text!r} of <{element.tag}> is not three numbers")
-    x, y, z = (_float(word, element, name, where) for word in words)
+    x, y, z = (_float(word, element, name, where, FARTHEST) for word in words)
     return x, y, z
 
 
@@ -40,11 +45,11 @@ def origin(element: Element, where: str) -> Origin:
     return Origin(vector(found, "xyz", where, HERE.xyz_m), vector(found, "rpy", where, HERE.rpy_rad))
 
 
-def _float(text: str, element: Element, name: str, where: str) -> float:
+def _float(text: str, element: Element, name: str, where: str, greatest: float = GREATEST) -> float:
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not isfinite(value):
-        raise UrdfError(f"{where}: {name}={text!r} of <{element.tag}> is not a number")
+    if not isfinite(value) or abs(value) > greatest:
+        raise UrdfError(f"{where}: {name}={text!r} of <{element.tag}> is not a number, or too large")
     return value
