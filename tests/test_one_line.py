@@ -10,7 +10,8 @@ import pytest
 from one_line import CALLIOPE, LINE, WHEELS, its, one_line, one_line_data
 from world_operator import EMPTY
 
-from apps.cli.servos import ServoWorkbench, _groups_of
+from apps.cli.servo_bench import ServoWorkbench
+from apps.cli.servos import _groups_of
 from cocoro import topics
 from cocoro.errors import ConfigError
 from cocoro.joints import GROUPS

@@ -14,7 +14,7 @@ from wire_servos import REPLY_S, WHEEL, ServoBench
 
 from apps.cli.doctor import _own_checks
 from apps.cli.main import main
-from apps.cli.servos import ServoWorkbench
+from apps.cli.servo_bench import ServoWorkbench
 from cocoro.errors import RefusedError
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol

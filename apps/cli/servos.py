@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import select
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,27 +23,21 @@ from apps.cli.options import (
     ThroughOption,
 )
 from apps.cli.output import complain, print_json, tell
+from apps.cli.servo_bench import REPLY_S, BaudOption, PortOption, ServoWorkbench, WriteOption
+from apps.cli.servo_import import import_lerobot
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
-from cocoro.component import load
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
 from cocoro.joints import GROUPS, Group, Joint
 from cocoro.messages import ServoReply, ServoRequest
-from cocoro.ports import port_path
 from cocoro.robot import Robot
 from cocoro.topics import SERVOS
-from deploy import profiles
-from deploy.processes import named
-from deploy.profiles import Profile
 from services.servos import tools
 from services.servos.bus import ServoBus
-from services.servos.families import FAMILIES
 from services.servos.tools import FoundServo
 
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
 NOBODY = "this command waits for a person at a terminal, but standard input has ended"
-REPLY_S = 0.05
-"""Longest wait for one servo's reply on the serial line."""
 
 JointsArgument = Annotated[
     list[str] | None,
@@ -59,19 +51,9 @@ JointArguments = Annotated[
         metavar="JOINT...", autocompletion=completions.joints, help="Names of joints, worked on one after the other."
     ),
 ]
-PortOption = Annotated[
-    str | None, typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's.")
-]
 PortsOption = Annotated[
     list[str] | None,
     typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's. Repeatable."),
-]
-BaudOption = Annotated[
-    int | None, typer.Option("--baud", metavar="RATE", help="Baud rate, instead of the robot description's.")
-]
-WriteOption = Annotated[
-    Path | None,
-    typer.Option("--write", metavar="FILE", help="Write the result into this file, not the robot's measured file."),
 ]
 
 app = typer.Typer()
@@ -158,60 +140,6 @@ def _groups_of(joints: list[str], robot: Robot) -> dict[Group, list[str]]:
 
 
 # --- tools at the serial line -----------------------------------------------------------------------
-
-
-@dataclass
-class ServoWorkbench:
-    """A robot with the serial ports and the measured file that a profile names."""
-
-    profile: Profile
-    robot: Robot
-    ports: dict[str, str]
-    """Serial port by line."""
-    file: Path
-
-    @classmethod
-    def of(
-        cls, profile_name: str, write: Path | None, description: Path | None = None, measured: Path | None = None
-    ) -> ServoWorkbench:
-        """Raises ConfigError for a profile or a robot description that cannot be read."""
-        profile = profiles.read(profile_name).with_robot(description, measured)
-        description, measured = profile.robot_files
-        existing = measured if measured is not None and measured.exists() else None
-        robot = Robot.load(description, existing)
-        config = profile.config("servos", load(named("servos")).config)
-        ports = {line: port_path(config.port_of(line), profile.robot) for line in robot.networks}
-        return cls(profile, robot, ports, write or measured or Path(f"{profile.robot}-measured.toml"))
-
-    def joint(self, name: str) -> Joint:
-        if name not in self.robot.joints:
-            raise ConfigError(f"there is no joint {name!r}; {choice_of(name, self.robot.joints)}")
-        return self.robot.joints[name]
-
-    def owner(self, found: FoundServo) -> Joint | None:
-        """The joint whose servo was found: the only one with its ID, or of several the one whose line has its port."""
-        alike = [joint for joint in self.robot.joints.values() if joint.id == found.number]
-        if len(alike) > 1:
-            place = Path(found.port).resolve()
-            alike = [joint for joint in alike if Path(self.ports[joint.network]).resolve() == place]
-        return alike[0] if len(alike) == 1 else None
-
-    @contextmanager
-    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
-        """Opens the serial line that the joint's servo is on."""
-        row = self.robot.networks[joint.network]
-        where, family = port or self.ports[joint.network], FAMILIES[row.protocol]
-        with ServoBus(where, baud or row.baud, REPLY_S, family, tools.TRIES) as line:
-            yield line
-
-    def write(self, joint: Joint, values: dict[str, Any]) -> None:
-        """Prints the values before they are written: a file that cannot be written must not cost a calibration."""
-        text = ", ".join(f"{key} = {value}" for key, value in values.items())
-        print(f"{joint.name}: {text}", flush=True)
-        write_values(self.file, "joint", values, joint.name)
-        print(f"written to {self.file}")
-        if self.profile.measured is None:
-            print(f'Name the file in the profile: measured = "{self.file}"')
 
 
 @servos.command()
@@ -349,6 +277,9 @@ def limits(
                 ends_deg = tools.feel_limits(line, joint, _was_entered, status.show)
             bench.write(joint, {"limits_deg": ends_deg})
             tools.write_limits(line, joint, ends_deg)
+
+
+servos.command("import")(import_lerobot)
 
 
 def _wait_for_enter(text: str) -> None:
