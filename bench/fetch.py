@@ -89,7 +89,7 @@ class FetchLimits:
         beside_rad = max(abs(atan2(place_m[1], place_m[0])) - kinect.horizontal_fov_rad / 2, 0.0)
         claws = dict.fromkeys(robot.jaws, config.hand.open_rad)
         return {
-            "search": beside_rad / robot.joints[robot.head.pan].max_speed_radps
+            "search": beside_rad / robot.joints[robot.head_joints[0]].max_speed_radps
             + PICTURES / kinect.rate_hz
             + FRAME_LATENCY_S,
             "approach": max(drive_s, unfold_s),

@@ -34,11 +34,11 @@ __all__ = [
     "NS", "Action", "Answer", "AskerGoneError", "BadRequestError", "BatteryLowError", "Bus", "BusyError",
     "CallTimeoutError", "Catalogue", "Clock", "CocoroError", "Component", "ConfigError", "Contact", "Core",
     "FollowedClock", "History", "HoldingError", "Implementation", "Inbox", "Latest", "MeshError", "Message", "Motion",
-    "NoTaskError", "Node", "NotAliveError", "NotGraspableError", "NotHoldingError", "ObjectSpec", "Output",
-    "Participant", "Pose2", "Publisher", "Qos", "RealClock", "RefusedError", "RemoteError", "Request", "Robot",
-    "Sample", "Schedule", "ServiceLatch", "Skills", "StoppedError", "Stream", "Take", "Task", "TaskCancelledError",
-    "TaskEndedError", "TaskFailedError", "TaskLostError", "TaskRefusedError", "Topic", "UnknownLabelError",
-    "VirtualClock", "every", "is_fresh", "run_virtual",
+    "NoTaskError", "Node", "NotAbleError", "NotAliveError", "NotGraspableError", "NotHoldingError", "ObjectSpec",
+    "Output", "Participant", "Pose2", "Publisher", "Qos", "RealClock", "RefusedError", "RemoteError", "Request",
+    "Robot", "Sample", "Schedule", "ServiceLatch", "Skills", "StoppedError", "Stream", "Take", "Task",
+    "TaskCancelledError", "TaskEndedError", "TaskFailedError", "TaskLostError", "TaskRefusedError", "Topic",
+    "UnknownLabelError", "VirtualClock", "every", "is_fresh", "run_virtual",
 ]  # fmt: skip
 
 _LENT = {

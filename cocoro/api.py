@@ -44,6 +44,7 @@ from cocoro.task_errors import BadRequestError as BadRequestError
 from cocoro.task_errors import BatteryLowError as BatteryLowError
 from cocoro.task_errors import BusyError as BusyError
 from cocoro.task_errors import HoldingError as HoldingError
+from cocoro.task_errors import NotAbleError as NotAbleError
 from cocoro.task_errors import NotAliveError as NotAliveError
 from cocoro.task_errors import NoTaskError as NoTaskError
 from cocoro.task_errors import NotGraspableError as NotGraspableError

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import tomllib
 from importlib import resources
-from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,25 +14,15 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.base import Base
+from cocoro.description_checks import check_box, check_camera, check_claw, check_poses
+from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker
 from cocoro.errors import ConfigError
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
 from cocoro.link_row import LinkRow
-from cocoro.units import Positive, Vec3
+from cocoro.units import Vec3
 
 OWN_FILE = "calliope.toml"
 _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
-
-LensValues = tuple[float, float, float, float, float, float, float, float, float]
-"""fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
-
-
-class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The joints that turn the camera."""
-
-    pan: str
-    """About the vertical, counter-clockwise positive."""
-    tilt: str
-    """Down positive."""
 
 
 class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,76 +41,6 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def azimuth(self) -> str:
         """The joint that turns the arm about the vertical."""
         return self.joints[0]
-
-
-class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    width: int
-    height: int
-    rate_hz: Positive
-    horizontal_fov_rad: Positive
-    vertical_fov_rad: Positive
-    depth_offset_m: Vec3
-    projector_offset_m: Vec3
-    min_range_m: Positive
-    max_range_m: Positive
-    depth_curve: Vec3
-    mount_min_m: Vec3
-    mount_max_m: Vec3
-    colour_lens: LensValues | None = None
-    depth_lens: LensValues | None = None
-    """Calibration of both lenses. The driver rectifies its images; readers of frames use the fields of view above."""
-    depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
-    """Rotation vector from the depth camera's frame to the colour camera's."""
-    link: str = "camera"  # what it was called before it could be called otherwise
-    """The link that carries it, whose frame is the colour camera's: x right, y down, z forward."""
-
-
-class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The ball on the hand that babbling looks at; `position_m` is in the link's frame."""
-
-    link: str
-    radius_m: Positive
-    position_m: Vec3
-
-
-class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    pad_length_m: Positive
-    """Length of a finger and of the pad along it."""
-    open_sign: dict[str, float]
-    """By joint, the sign of the angles towards which it opens."""
-    level_roll_deg: float
-    """The hand's roll at which the claws lie level, for upright targets; the marker then stands above the hand."""
-    pad_gap_m: Positive
-    """Distance of the pads at angle 0 of the claws, at which they are parallel."""
-    pad_height_m: Positive
-    pad_thickness_m: Positive
-
-    @property
-    def level_roll_rad(self) -> float:
-        return radians(self.level_roll_deg)
-
-
-class Tube(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stretch of the arm's hull: balls evenly spaced from one link's origin to another's, both ends included."""
-
-    name: str
-    start: str
-    end: str
-    radius_m: Positive
-    balls: Annotated[int, Meta(ge=2)]
-
-
-class Hull(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The space that arm and hand take up, and the Kinect's housing, for keeping them apart."""
-
-    kinect_min_m: Vec3
-    kinect_max_m: Vec3
-    """A box, body frame, that holds the Kinect's housing at every head angle."""
-    finger_radius_m: Positive
-    finger_turn_deg: dict[str, float]
-    """By claw link, the angle in its x-y plane from its x axis to its finger."""
-    tube: Annotated[list[Tube], Meta(min_length=1)]
-    """From the chassis out. The first one turns on the chassis and is not checked against it."""
 
 
 Shape = Literal["box", "sphere", "cylinder"]
@@ -162,14 +81,15 @@ class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `mount` is the mount."""
 
 
-class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: str
     base: Base
     kinect: Kinect
-    head: Head
+    head: Head | None = None
     link: list[LinkRow]
     arm: Arm
-    marker: Marker
+    marker: Marker | None = None
+    """Without it the robot learns nothing from the sight of its hand."""
     network: dict[LineName, Network]
     joint: list[JointRow]
     claw: Claw
@@ -179,17 +99,19 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Refuses what contradicts itself: names of links and joints that the description does not have, circles of
-        links, lines with one ID twice, limbs whose joints move nothing or are on several lines, poses without a joint
-        that they need, boxes whose corners are swapped."""
+        links, lines with one ID twice, limbs whose joints move nothing or are on several lines, a camera that other
+        joints turn than the head's, poses without a joint that they need, boxes with one corner or swapped ones."""
         self._check_links()
         self._check_places()
         self._check_limbs()
-        for where, low_m, high_m in (
-            ("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m),
-            ("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m),
-        ):
-            if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
-                raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+        check_camera(self.kinect.link, {row.name: (row.parent, row.joint) for row in self.link}, self._head_joints)
+        check_claw(len(self.claw.open_sign), self.claw.fixed_pad_m)
+        check_box("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m)
+        check_box("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m)
+
+    @property
+    def _head_joints(self) -> set[str]:
+        return set() if self.head is None else {self.head.pan, self.head.tilt}
 
     @property
     def groups(self) -> dict[str, Group]:
@@ -224,7 +146,8 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def _check_places(self) -> None:
         links = {row.name for row in self.link}
-        places = [("marker", self.marker.link), ("arm.tip", self.arm.tip), ("kinect.link", self.kinect.link)]
+        places = [("arm.tip", self.arm.tip), ("kinect.link", self.kinect.link)]
+        places += [("marker", self.marker.link)] if self.marker is not None else []
         places += [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
         places += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
         places += [(f"part {part.name}", part.link) for part in self.solid.part if part.link != "body"]
@@ -238,7 +161,7 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def _check_limbs(self) -> None:
         arm, joints = self.arm, {joint.name for joint in self.joint}
         check_lines(self.joint, self.network)
-        limbs = [("claw", set(self.claw.open_sign)), ("head", {self.head.pan, self.head.tilt})]
+        limbs = [("claw", set(self.claw.open_sign)), ("head", self._head_joints)]
         limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
         for where, named in [*poses, *limbs, ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]:
@@ -253,9 +176,7 @@ class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_groups(self.joint, groups := self.groups)
         if lost := [joint for joint in arm.joints if groups.get(joint) != "arm"]:
             raise ValueError(f"arm: the joint {lost[0]!r} is not between the body and the hand")
-        for name, wanted in (("park", arm.joints), ("upright", arm.joints), ("unfolded", arm.joints[1:])):
-            if missing := [joint for joint in wanted if joint not in self.pose.get(name, {})]:
-                raise ValueError(f"pose {name}: the angle of {missing[0]!r} is missing")
+        check_poses(self.pose, arm.joints)
 
 
 def read(path: Path | None, override: Path | None) -> Description:

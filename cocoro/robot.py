@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from math import pi, radians, tan
@@ -14,6 +15,7 @@ from msgspec import UNSET
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
 from cocoro.description import Description, completed, read
+from cocoro.description_limbs import Marker
 from cocoro.errors import ConfigError, field_text
 from cocoro.joints import GROUPS, Group, Joint, Network
 from cocoro.kinematics import Chain, DenavitHartenberg, Link, Origin, Tree
@@ -132,6 +134,12 @@ class Robot:
         """The joints that close the hand."""
         return tuple(self.claw.open_sign)
 
+    @cached_property
+    def fingers(self) -> tuple[str, ...]:
+        """The two links that hold what is grasped: the jaws', and with one jaw the hand's, which has the fixed one."""
+        moving = tuple(self.link_of(jaw) for jaw in self.jaws)
+        return moving if self.claw.fixed_pad_m is None else (*moving, self.link_of(self.arm.roll))
+
     def link_of(self, joint: str) -> str:
         """The link that a joint moves. Raises KeyError naming a joint that moves none."""
         for link in self.links.values():
@@ -139,14 +147,41 @@ class Robot:
                 return link.name
         raise KeyError(f"joint {joint!r} moves no link")
 
+    @property
+    def the_marker(self) -> Marker:
+        """The ball on the hand. Raises ConfigError where there is none."""
+        if self.marker is None:
+            raise ConfigError(f"{self.name} has no marker on its hand: its description has no table [marker]")
+        return self.marker
+
     @cached_property
     def camera_chain(self) -> Chain:
         """From the body to the colour camera's frame: x right, y down, z forward."""
         return self.chain(self.kinect.link)
 
+    def lacks(self, parts: Iterable[str]) -> str:
+        """The first of the parts (`cocoro.tasks.BodyPart`) that this robot does not have, a sentence; '' when it has
+        them all."""
+        without: dict[str, str] = {}
+        if self.marker is None:
+            without["marker"] = "has no marker on its hand that its camera could see"
+        if self.head is None:
+            without["neck"] = "has no neck: its camera is fixed on its body"
+        return next((f"{self.name} {without[part]}" for part in parts if part in without), "")
+
+    @cached_property
+    def head_joints(self) -> tuple[str, ...]:
+        """The joints that pan and tilt the camera; none where it is fixed on the body."""
+        return (self.head.pan, self.head.tilt) if self.head is not None else ()
+
     def head_angles(self, pan_rad: float = 0.0, tilt_rad: float = 0.0) -> dict[str, float]:
-        """The angles of the head's joints, rad, by their names."""
-        return {self.head.pan: pan_rad, self.head.tilt: tilt_rad}
+        """The angles of the head's joints, rad, by their names; none of a camera that is fixed on the body."""
+        return dict(zip(self.head_joints, (pan_rad, tilt_rad), strict=False))
+
+    @cached_property
+    def camera_pivot(self) -> str:
+        """The link about whose place the camera tilts: that of the neck's tilt, or the fixed camera's own."""
+        return self.link_of(self.head.tilt) if self.head is not None else self.kinect.link
 
     def chain(self, tip: str) -> Chain:
         """The links from the body to the tip. Raises KeyError naming a link that is missing."""

@@ -71,6 +71,10 @@ class AskerGoneError(TaskRefusedError):
     """The robot does not see the client that asked: the two lost contact meanwhile."""
 
 
+class NotAbleError(TaskRefusedError):
+    """The robot's body lacks a part that the task needs."""
+
+
 REFUSALS: dict[RefusalCode, type[TaskRefusedError]] = {
     "unknown_label": UnknownLabelError,
     "not_graspable": NotGraspableError,
@@ -83,6 +87,7 @@ REFUSALS: dict[RefusalCode, type[TaskRefusedError]] = {
     "bad_request": BadRequestError,
     "no_task": NoTaskError,
     "asker_gone": AskerGoneError,
+    "not_able": NotAbleError,
 }
 
 

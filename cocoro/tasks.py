@@ -27,6 +27,9 @@ from cocoro.tagged import Registry, Tagged
 from cocoro.topics import Topic
 from cocoro.units import Positive, Vec2, Vec3
 
+BodyPart = Literal["marker", "neck"]
+"""Parts of a body that not every robot has."""
+
 UNLIMITED_S = 86_400.0
 """Time limit of a task that has no end of its own."""
 
@@ -111,6 +114,8 @@ class Task(Tagged, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
     """Whether the object that `label` names must be known, or known and graspable."""
     hand: ClassVar[Literal["empty", "holding", "any"]] = "empty"
     """State of the hand in which the task may start."""
+    needs_body: ClassVar[tuple[BodyPart, ...]] = ()
+    """Parts that not every robot has and that the task cannot do without."""
     needs_battery: ClassVar[bool] = True
     """False: the task may start with a low battery."""
     snapshot_phase: ClassVar[str] = ""

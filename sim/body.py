@@ -26,6 +26,7 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.base import Base
 from cocoro.description import Part
+from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 
 CASTER_RADIUS_M = 0.010
@@ -107,12 +108,15 @@ def inertia_of(part: Part) -> FloatArray:
 
 def body_of_parts(robot: Robot) -> SimBody:
     """Build the robot's parts. The chassis gets the rest of the robot's mass."""
-    base, kinect = robot.base, robot.kinect
-    low, high = np.array(kinect.mount_min_m), np.array(kinect.mount_max_m)
-    mount_x, mount_y, mount_z = ((low + high) / 2).tolist()
-    mount = Part(MOUNT, MOUNT, "box", tuple((high - low).tolist()), rgb=_WHITE, mass_kg=robot.solid.mount_mass_kg)
-    parts: dict[str, list[Part]] = {MOUNT: [mount]}
-    extras = [Extra(MOUNT, (mount_x, mount_y, mount_z))]
+    base = robot.base
+    parts: dict[str, list[Part]] = {}
+    extras: list[Extra] = []
+    if robot.kinect.mount is not None:
+        low, high = np.array(robot.kinect.mount)
+        x, y, z = ((low + high) / 2).tolist()
+        mass_kg = robot.solid.mount_mass_kg
+        parts[MOUNT] = [Part(MOUNT, MOUNT, "box", tuple((high - low).tolist()), rgb=_WHITE, mass_kg=mass_kg)]
+        extras.append(Extra(MOUNT, (x, y, z)))
     on_body = [part for part in robot.solid.part if part.link == "body"]
     for part in on_body:
         if part.solid:
@@ -127,12 +131,14 @@ def body_of_parts(robot: Robot) -> SimBody:
         if part.link != "body":
             parts.setdefault(part.link, []).append(part)
     inside = [part for part in on_body if not part.solid]
-    ball = robot.marker
-    marker = Part("marker", ball.link, "sphere", (ball.radius_m,), ball.position_m, _MAGENTA, solid=False)
-    parts.setdefault(ball.link, []).append(marker)
+    if (ball := robot.marker) is not None:
+        marker = Part("marker", ball.link, "sphere", (ball.radius_m,), ball.position_m, _MAGENTA, solid=False)
+        parts.setdefault(ball.link, []).append(marker)
     for jaw in robot.jaws:
         link = robot.link_of(jaw)
         parts.setdefault(link, []).extend(_jaw(robot, link))
+        if robot.claw.fixed_pad_m is not None:
+            parts.setdefault(robot.link_of(robot.arm.roll), []).append(_fixed_pad(robot, link, robot.claw.fixed_pad_m))
     rest = base.mass_kg - sum(part.mass_kg for rows in parts.values() for part in rows)
     rest -= sum(part.mass_kg for part in inside)
     size = base.chassis_diameter_m / 2, base.chassis_height_m
@@ -143,7 +149,7 @@ def body_of_parts(robot: Robot) -> SimBody:
         *(Extra(name, (x, 0.0, CASTER_RADIUS_M)) for name, x in zip(casters, (CASTER_X_M, -CASTER_X_M), strict=False)),
     ]
     friction = dict.fromkeys(radii, Friction(1.0)) | dict.fromkeys(casters, Friction(0.0))
-    friction |= {robot.link_of(jaw): Friction(0.9, spinning=0.01) for jaw in robot.jaws}
+    friction |= {finger: Friction(0.9, spinning=0.01) for finger in robot.fingers}
     return SimBody(parts, extras, radii, friction)
 
 
@@ -186,8 +192,9 @@ def _jaw(robot: Robot, link: str) -> list[Part]:
     tip = robot.chain(robot.arm.tip).pose(hand)
     to_claw = np.linalg.inv(robot.chain(link).pose(hand))
     reach = float((to_claw @ tip)[1, 3])  # from the claw's axis to the pad, along the roll axis
-    offset = -float((to_claw @ root)[0, 3])  # from the roll axis to the claw's axis
-    face = claw.pad_gap_m / 2 - offset
+    axis = root if claw.fixed_pad_m is None else tip
+    offset = -float((to_claw @ axis)[0, 3])  # from the hand's axis to the claw's
+    face = claw.jaw_pad_m - offset
     thickness, height, length = claw.pad_thickness_m, claw.pad_height_m, claw.pad_length_m
     middle = face + thickness / 2
     toward = 1.0 if reach > 0 else -1.0
@@ -198,3 +205,20 @@ def _jaw(robot: Robot, link: str) -> list[Part]:
         Part(f"{link}_pad", link, "box", (thickness, length, height), (middle, reach, 0.0), _DARK, 0.035),
         Part(f"{link}_bracket", link, "box", bracket, place, _GREY, 0.045),
     ]
+
+
+def _fixed_pad(robot: Robot, jaw: str, from_axis_m: float) -> Part:
+    """The pad that faces the only jaw, in the frame of the hand's link. Raises ConfigError when the jaw opens along
+    neither x nor y of that frame."""
+    hand, claw = dict.fromkeys(robot.joints, 0.0), robot.claw
+    link = robot.link_of(robot.arm.roll)
+    from_hand = np.linalg.inv(robot.chain(link).pose(hand))
+    tip = (from_hand @ robot.chain(robot.arm.tip).pose(hand))[:3, 3]
+    opens = (from_hand @ robot.chain(jaw).pose(hand))[:3, 0]
+    along = int(np.abs(opens).argmax())
+    if along == 2 or abs(opens[along]) < 0.99:
+        raise ConfigError(f"{robot.name}: the jaw {jaw} opens along neither x nor y of the link {link}")
+    size = [claw.pad_height_m, claw.pad_height_m, claw.pad_length_m]
+    size[along] = claw.pad_thickness_m
+    x, y, z = (tip - opens * (from_axis_m + claw.pad_thickness_m / 2)).tolist()
+    return Part("fixed_pad", link, "box", tuple(size), (x, y, z), _DARK, 0.035)

@@ -102,12 +102,13 @@ class CoverageJudge:
         seen &= (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
         shown = np.flatnonzero(seen)
         seen[shown] = ~self._hidden(truth, eye, points[shown])
-        low, high = np.array(kinect.mount_min_m), np.array(kinect.mount_max_m)
-        turn = body[:3, :3]
-        shown = np.flatnonzero(seen)
-        seen[shown] = ~_meets_box(
-            (eye - body[:3, 3]) @ turn, (points[shown] - body[:3, 3]) @ turn, (low + high) / 2, (high - low) / 2
-        )
+        if kinect.mount is not None:
+            low, high = np.array(kinect.mount)
+            turn = body[:3, :3]
+            shown = np.flatnonzero(seen)
+            seen[shown] = ~_meets_box(
+                (eye - body[:3, 3]) @ turn, (points[shown] - body[:3, 3]) @ turn, (low + high) / 2, (high - low) / 2
+            )
         under: BoolArray = np.hypot(*(cells_m - body[:2, 3]).T) <= self._robot.base.chassis_diameter_m / 2
         return seen | under
 

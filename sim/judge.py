@@ -53,7 +53,7 @@ class Judge:
 
     def __init__(self, robot: Robot, scene: Scene, target: str = "") -> None:
         self._scene = scene
-        self._jaws = frozenset(robot.link_of(jaw) for jaw in robot.jaws)
+        self._jaws = frozenset(robot.fingers)
         self._target = scene.object(target).label if target else ""
         self._first: dict[str, Vec3] = {}
         self._first_bottom_m = 0.0

@@ -33,6 +33,8 @@ JOINT_GAIN = 0.1
 NO_LIMIT_RADPS = -1.0
 """PyBullet's value for a motor without a speed limit."""
 
+_LEVEL = (0.0, 0.0, 0.0, 1.0)
+
 JointReading = tuple[float, float, float]
 """Angle, rad; speed, rad/s; torque of the motor, N m."""
 
@@ -69,8 +71,10 @@ class Mechanism:
         self._wheel_rad = [0.0] * len(self._wheels)
         self._wheel_goal_rad = [0.0] * len(self._wheels)
         self._read_indices = [*self._motors.values(), *self._wheels]
-        # PyBullet gives the pose of the root's centre of mass.
-        self._root_offset = np.array(bullet.getDynamicsInfo(self.body, -1)[3])
+        # PyBullet gives the pose of the root's principal axes of inertia.
+        info = bullet.getDynamicsInfo(self.body, -1)
+        self._root_offset = np.array(info[3])
+        self._root_turned: Quaternion | None = None if tuple(info[4]) == _LEVEL else tuple(info[4])
         self._link_indices = list(range(len(infos)))
         self._prepare(model, angles_rad)
 
@@ -132,13 +136,21 @@ class Mechanism:
         """World position (m) and orientation (x, y, z, w) of the body frame."""
         pose = self.root_pose()
         x, y, z = (float(value) for value in pose[:3, 3])
-        return (x, y, z), self._bullet.getBasePositionAndOrientation(self.body)[1]
+        return (x, y, z), self._orientation(self._bullet.getBasePositionAndOrientation(self.body)[1])
+
+    def _orientation(self, axes: Quaternion) -> Quaternion:
+        """The body frame's orientation by that of its principal axes of inertia."""
+        if self._root_turned is None:
+            return axes
+        back = self._bullet.invertTransform((0.0, 0.0, 0.0), self._root_turned)[1]
+        turned: Quaternion = self._bullet.multiplyTransforms((0.0, 0.0, 0.0), axes, (0.0, 0.0, 0.0), back)[1]
+        return turned
 
     def root_pose(self) -> FloatArray:
         """World pose of the body frame, (4, 4)."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.body)
         pose = np.zeros((4, 4))
-        pose[:3, :3] = rotation(orientation)
+        pose[:3, :3] = rotation(self._orientation(orientation))
         pose[:3, 3] = np.array(position) - pose[:3, :3] @ self._root_offset
         pose[3, 3] = 1.0
         return pose

@@ -120,7 +120,7 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     data = robot.to_data()
     rows = {row["name"]: row for row in data["link"]}
     arm_links = [robot.link_of(joint) for joint in (*robot.arm.joints, robot.arm.roll)]
-    head_links = [robot.link_of(joint) for joint in (robot.head.pan, robot.head.tilt)]
+    head_links = [robot.link_of(joint) for joint in robot.head_joints]
     for name in arm_links:
         _stretch(rows[name], rng)
     for name in head_links + arm_links:
@@ -133,8 +133,9 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
         data["link"].append(row)
         camera["parent"] = row["name"]
     data["link"].append(camera)
-    marker = np.array(data["marker"]["position_m"]) + MARKER_M * _direction(rng)
-    data["marker"]["position_m"] = tuple(marker.tolist())
+    if data["marker"] is not None:
+        marker = np.array(data["marker"]["position_m"]) + MARKER_M * _direction(rng)
+        data["marker"]["position_m"] = tuple(marker.tolist())
     if robot.base.kind == "differential":
         data["base"]["wheel_separation_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M))
     for wheel in data["base"]["wheel"]:

@@ -106,7 +106,7 @@ class World:
         self._stage = Stage(self._bullet, scene)
         self._wear = wear if wear is not None else Wear(robot)
         self._model = build_model(self._wear.robot)
-        self._jaws = frozenset(robot.link_of(jaw) for jaw in robot.jaws)
+        self._jaws = frozenset(robot.fingers)
         angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
         self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
         self._mechanism.roll_on_floor_alone([body for name, body in self._stage.bodies.items() if name != FLOOR])

@@ -15,8 +15,9 @@ from cocoro.robot import Robot
 from services.perception.config import PerceptionConfig
 from services.perception.floor import FloorScanner
 from services.perception.image import RgbdImage
-from services.planning.config import SearchConfig
+from services.planning.config import HeadConfig, SearchConfig
 from services.planning.floor_map import FloorMap, Solid
+from services.planning.gaze import gaze_of
 from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import DepthView
 
@@ -43,7 +44,7 @@ class Room:
     def __post_init__(self) -> None:
         self.floor = FloorMap()
         self.doubt_m = 0.0
-        self.seen = SeenFloor(SearchConfig(), ROBOT)
+        self.seen = SeenFloor(SearchConfig(), ROBOT, gaze_of(ROBOT, HeadConfig()))
         self.now_ns = NS
         self._scanner = FloorScanner(ROBOT, PerceptionConfig())
         self._draws = np.random.default_rng(1)

@@ -128,6 +128,7 @@ def refused(code: str, text: str) -> TaskReply:
     [
         ("unknown_label", exits.USAGE),
         ("not_graspable", exits.USAGE),
+        ("not_able", exits.USAGE),
         ("busy", exits.REFUSED),
         ("not_holding", exits.REFUSED),
     ],

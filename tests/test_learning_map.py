@@ -44,11 +44,11 @@ def seen(robot: Robot) -> Sightings:
 
 def test_the_drawing_is_the_robots_own_kinematics(robot: Robot, nominal: NominalModel) -> None:
     assert nominal.joints == ("arm_base", "shoulder", "elbow", "wrist_pitch")
-    chain = robot.chain(robot.marker.link)
+    chain = robot.chain(robot.the_marker.link)
     angles = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 4))
     for row, place in zip(angles, nominal.predict(angles), strict=True):
         pose = chain.pose(dict(zip(nominal.joints, row, strict=True), wrist_roll=np.pi / 2))
-        assert np.allclose(place, (pose @ [*robot.marker.position_m, 1.0])[:3])
+        assert np.allclose(place, (pose @ [*robot.the_marker.position_m, 1.0])[:3])
         assert np.allclose(nominal.jacobian(row), slope_by_differences(nominal, row), atol=1e-7)
 
 

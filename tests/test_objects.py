@@ -45,7 +45,7 @@ def test_the_projects_own_objects_are_the_three_cans_two_balls_and_the_marker() 
 
 
 def test_the_marker_is_as_large_as_the_robot_description_says() -> None:
-    assert Catalogue.load()["hand_marker"].radius_m == Robot.load().marker.radius_m
+    assert Catalogue.load()["hand_marker"].radius_m == Robot.load().the_marker.radius_m
 
 
 def test_a_label_that_is_not_there_is_told_apart_from_one_that_is() -> None:

@@ -31,6 +31,7 @@ from cocoro.robot import Robot
 from services.planning.arm import ArmController
 from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
+from services.planning.gaze import gaze_of
 from services.planning.postures import Postures, sobol
 from services.planning.reach import HandPose, Reacher
 
@@ -39,9 +40,13 @@ ARM, ROLL = Robot.load().arm.joints, Robot.load().arm.roll
 CONFIG = PlanningConfig()
 
 
+def postures_of(robot: Robot) -> Postures:
+    return Postures(robot, gaze_of(robot, CONFIG.head))
+
+
 @pytest.fixture(scope="module")
 def postures(robot: Robot) -> Postures:
-    return Postures(robot)
+    return postures_of(robot)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +98,7 @@ def test_a_tube_that_a_measured_file_adds_does_not_count_as_hand(postures: Postu
     file.write_text(
         '[[hull.tube]]\nname = "bracket"\nstart = "elbow"\nend = "wrist_pitch"\nradius_m = 0.02\nballs = 4\n'
     )
-    bracketed = Postures(Robot.load(override=file))  # the bracket is inside of the forearm
+    bracketed = postures_of(Robot.load(override=file))  # the bracket is inside of the forearm
     draws = [posture for _, posture in islice(sobol(1, postures.ranges), 100)]
     assert [bracketed.safe(posture) for posture in draws] == [postures.safe(posture) for posture in draws]
 

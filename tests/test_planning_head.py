@@ -9,14 +9,16 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from cocoro.frames import Pose2
 from cocoro.robot import Robot
 from services.planning.config import HeadConfig
-from services.planning.head import Gaze, Sweep
+from services.planning.gaze import Neck
+from services.planning.head import neck_sweep
 
 ROBOT = Robot.load()
 CONFIG = HeadConfig()
-GAZE = Gaze(ROBOT, CONFIG)
-PAN, TILT = ROBOT.head.pan, ROBOT.head.tilt
+GAZE = Neck(ROBOT, CONFIG)
+PAN, TILT = ROBOT.head_joints
 CAMERA = ROBOT.chain("camera")
 
 
@@ -42,10 +44,10 @@ def test_what_it_looks_at_comes_to_the_middle_from_wherever_it_looked(
     distance_m: float, bearing_rad: float, height_m: float, pan: float, tilt: float
 ) -> None:
     point = place(distance_m, bearing_rad, height_m)
-    goal = GAZE.at(point, {PAN: pan, TILT: tilt})
+    goal = GAZE.at_one(point, {PAN: pan, TILT: tilt})
     assume(CONFIG.tilt_range_rad[0] + 0.01 < goal[1] < CONFIG.tilt_range_rad[1] - 0.01)
     for _ in range(2):  # it is asked anew at every step, from where it has got to
-        goal = GAZE.at(point, {PAN: goal[0], TILT: goal[1]})
+        goal = GAZE.at_one(point, {PAN: goal[0], TILT: goal[1]})
     assert off_centre_px(point, *goal) < 5.0
 
 
@@ -55,7 +57,7 @@ def test_what_it_looks_at_comes_to_the_middle_from_wherever_it_looked(
     tilt=st.floats(-2.6, 2.6),
 )
 def test_it_never_looks_further_than_the_neck_turns(point: tuple[float, float, float], pan: float, tilt: float) -> None:
-    goal_pan, goal_tilt = GAZE.at(point, {PAN: pan, TILT: tilt})
+    goal_pan, goal_tilt = GAZE.at_one(point, {PAN: pan, TILT: tilt})
     low, high = ROBOT.joints[PAN].limits_rad
     assert low <= goal_pan <= high
     assert CONFIG.tilt_range_rad[0] <= goal_tilt <= CONFIG.tilt_range_rad[1]
@@ -63,7 +65,7 @@ def test_it_never_looks_further_than_the_neck_turns(point: tuple[float, float, f
 
 def swept(pan: float) -> list[tuple[float, float]]:
     """The aims of a sweep, in order."""
-    sweep = Sweep(CONFIG, pan)
+    sweep = neck_sweep(CONFIG, pan)
     aims: list[tuple[float, float]] = []
     for _ in range(100):
         if sweep.done:
@@ -90,7 +92,7 @@ def test_a_sweep_looks_ahead_first_and_then_to_both_sides() -> None:
 
 
 def test_a_sweep_counts_its_own_progress() -> None:
-    sweep = Sweep(CONFIG, 0.0)
+    sweep = neck_sweep(CONFIG, 0.0)
     assert (sweep.share, sweep.done) == (0.0, False)
     shares = []
     while not sweep.done:
@@ -110,8 +112,8 @@ def test_one_picture_shows_two_places_that_are_near_enough_to_each_other(
     near_m: float, far_m: float, bearing_rad: float, apart_rad: float
 ) -> None:
     far, near = place(far_m, bearing_rad, 0.06), place(near_m, bearing_rad + apart_rad, 0.0)
-    both = GAZE.at_both(far, [near], {PAN: 0.0, TILT: 0.0})
-    alone = GAZE.at(far, {PAN: 0.0, TILT: 0.0})
+    both = GAZE.at(far, [near], {PAN: 0.0, TILT: 0.0}, Pose2())
+    alone = GAZE.at_one(far, {PAN: 0.0, TILT: 0.0})
     assert both == alone or all(in_picture(point, *both) for point in (far, near))
 
 

@@ -38,7 +38,7 @@ def test_lengths_zeros_marker_and_wheels_stay_within_their_bounds(robot: Robot) 
             assert hypot(x, y) <= 0.005
             assert abs(z) <= 0.005
             assert abs(degrees(real.offset_rad - drawn.offset_rad)) <= 2.0
-        off = np.subtract(worn.marker.position_m, robot.marker.position_m)
+        off = np.subtract(worn.the_marker.position_m, robot.the_marker.position_m)
         assert np.linalg.norm(off) == pytest.approx(0.005)
         assert abs(worn.base.axle_m - robot.base.axle_m) <= 0.008
 
@@ -80,10 +80,10 @@ def test_the_world_is_built_from_the_worn_body_while_its_odometry_keeps_the_draw
         operator.run(0.5, wheels_mps=(0.0, 0.0))
         truth = world.truth()
         body = world.link_pose("body")
-        marker = np.linalg.inv(body) @ world.link_pose("wrist_roll") @ [*wear.robot.marker.position_m, 1.0]
+        marker = np.linalg.inv(body) @ world.link_pose("wrist_roll") @ [*wear.robot.the_marker.position_m, 1.0]
         angles = truth.joints_rad
-        real = wear.robot.chain("wrist_roll").pose(angles) @ [*wear.robot.marker.position_m, 1.0]
-        drawn = robot.chain("wrist_roll").pose(angles) @ [*robot.marker.position_m, 1.0]
+        real = wear.robot.chain("wrist_roll").pose(angles) @ [*wear.robot.the_marker.position_m, 1.0]
+        drawn = robot.chain("wrist_roll").pose(angles) @ [*robot.the_marker.position_m, 1.0]
         assert np.linalg.norm(marker - real) < 1e-4
         assert 0.003 < np.linalg.norm(marker - drawn) < 0.06
         yaw = 2 * np.arctan2(truth.body_orientation[2], truth.body_orientation[3])
@@ -100,6 +100,6 @@ def test_a_bent_forearm_carries_the_hand_three_centimetres_off_while_the_servo_n
         before, said = world.link_pose("wrist_roll"), world.servo_state("arm").position_rad
         operator.run(1.5, arm=pose)
         after = world.link_pose("wrist_roll")
-        marker = [*robot.marker.position_m, 1.0]
+        marker = [*robot.the_marker.position_m, 1.0]
         assert np.linalg.norm((after - before) @ marker) == pytest.approx(0.03, abs=0.008)
         assert np.allclose(world.servo_state("arm").position_rad, said, atol=0.012)

@@ -190,7 +190,7 @@ def test_visuals_have_poses_and_the_marker_stands_where_the_description_puts_it(
     assert poses[:, 3] == pytest.approx(np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1)))
     place = {visual.name: pose for visual, pose in zip(empty.visuals, poses, strict=True)}
     assert len(place) == len(poses)
-    marker = empty.link_pose("wrist_roll") @ [*ROBOT.marker.position_m, 1.0]
+    marker = empty.link_pose("wrist_roll") @ [*ROBOT.the_marker.position_m, 1.0]
     assert place["marker"][:3, 3] == pytest.approx(marker[:3], abs=1e-6)
     low, high = np.array(ROBOT.kinect.mount_min_m), np.array(ROBOT.kinect.mount_max_m)
     assert place["mount"][:3, 3] == pytest.approx((low + high) / 2, abs=5e-4)

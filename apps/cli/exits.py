@@ -7,5 +7,5 @@ REFUSED = 3
 """Refused by the robot, or cancelled."""
 NO_MESH = 4
 
-USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
-"""Refusals of the robot that are the operator's mistake, not the robot's state: their exit code is USAGE."""
+USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request", "not_able")
+"""Refusals that no state of the robot would change: their exit code is USAGE."""

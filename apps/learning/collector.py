@@ -78,7 +78,7 @@ class HandCollector(SampleCollector[HandRow]):
     """Samples of the arm's babbling."""
 
     def __init__(self, path: Path, robot: Robot) -> None:
-        self._joints, self._head = arm_joints(robot), robot.head
+        self._joints, self._head = arm_joints(robot), robot.head_joints
         super().__init__(SampleFile(path, HandRow, robot, hand_header(robot, self._joints, robot.claw.level_roll_rad)))
         self._coverage = Coverage()
         for row in self._writer.rows:
@@ -100,7 +100,7 @@ class HandCollector(SampleCollector[HandRow]):
                 stamp_ns=message.stamp_ns,
                 draw=message.draw,
                 angles_rad=tuple(angles[name] for name in self._joints),
-                head_rad=(angles[self._head.pan], angles[self._head.tilt]),
+                head_rad=(angles[self._head[0]], angles[self._head[1]]) if self._head else (0.0, 0.0),
                 seen_m=message.seen_m,
                 area_px=message.area_px,
             )

@@ -29,8 +29,9 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def arm_joints(robot: Robot) -> tuple[str, ...]:
-    """The arm's joints that move the marker; the hand's roll is none of them."""
-    return tuple(name for name in robot.chain(robot.marker.link).joints if name in robot.arm.joints)
+    """The arm's joints that move the marker; the hand's roll is none of them. Raises ConfigError for a robot without
+    a marker."""
+    return tuple(name for name in robot.chain(robot.the_marker.link).joints if name in robot.arm.joints)
 
 
 def fingerprint_of(robot: Robot) -> str:
@@ -63,19 +64,21 @@ class NominalModel:
     """
 
     def __init__(self, robot: Robot, roll_rad: float | None = None) -> None:
-        """`roll_rad`: the hand's roll; None is the one at which the claws lie level, which babbling keeps."""
+        """`roll_rad`: the hand's roll; None is the one at which the claws lie level, which babbling keeps.
+        Raises ConfigError for a robot without a marker."""
+        marker = robot.the_marker
         roll_rad = robot.claw.level_roll_rad if roll_rad is None else roll_rad
         self.roll_rad = roll_rad
         self.joints = arm_joints(robot)
         self._roll = robot.arm.roll
         self.limits_rad = np.array([robot.joints[name].limits_rad for name in self.joints])
-        self._chain = robot.chain(robot.marker.link)
-        self._marker = np.array([*robot.marker.position_m, 1.0])
+        self._chain = robot.chain(marker.link)
+        self._marker = np.array([*marker.position_m, 1.0])
         self._rest = {name: roll_rad for name in self._chain.joints if name not in self.joints}
         self._steps: list[tuple[FloatArray, int, float]] = []
         """For each joint from the body on: the fixed transform before it (4, 4), its index in `joints`, its offset."""
         rows = []
-        name = robot.marker.link
+        name = marker.link
         while name != "body":
             rows.append(robot.links[name])
             name = robot.links[name].parent

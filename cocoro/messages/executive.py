@@ -54,7 +54,7 @@ class TaskRequest(msgspec.Struct, kw_only=True):
 
 RefusalCode = Literal[
     "unknown_label", "not_graspable", "busy", "estop", "not_alive", "battery", "holding", "not_holding", "bad_request",
-    "no_task", "asker_gone",
+    "no_task", "asker_gone", "not_able",
 ]  # fmt: skip
 
 

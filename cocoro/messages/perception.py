@@ -38,7 +38,7 @@ class Detections(Message):
     height: int
     pan_rad: Finite | None = None
     tilt_rad: Finite | None = None
-    """Head angles, interpolated at the frame's stamp, by which the objects were localised."""
+    """Head angles, interpolated at the frame's stamp, by which the objects were localised. None without a neck."""
     detections: tuple[Detection, ...] = ()
 
 

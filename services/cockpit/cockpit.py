@@ -174,6 +174,9 @@ class Cockpit:
         """What a page has to know of the robot."""
         robot = self.node.robot
         speed_mps = robot.base.max_wheel_speed_mps
+        turn_radps = round(speed_mps / robot.drive.lever_m, 3)
+        # A robot without a neck turns to look about.
+        looks_radps = [robot.joints[name].max_speed_radps for name in robot.head_joints] or [turn_radps, 0.0]
         return {
             "kind": "hello",
             "robot": self.node.robot_name,
@@ -184,9 +187,9 @@ class Cockpit:
             "body": {"radius_m": robot.base.chassis_diameter_m / 2},
             "limits": {
                 "speed_mps": speed_mps,
-                "turn_radps": round(speed_mps / robot.drive.lever_m, 3),
-                "pan_radps": robot.joints[robot.head.pan].max_speed_radps,
-                "tilt_radps": robot.joints[robot.head.tilt].max_speed_radps,
+                "turn_radps": turn_radps,
+                "pan_radps": looks_radps[0],
+                "tilt_radps": looks_radps[1],
             },
             "fps": self.config.fps,
         }

@@ -142,6 +142,8 @@ class Executive:
                 return "unknown_label", f"unknown object {task.target!r}; {choice_of(task.target, targets)}"
             if grasping and not known.graspable:
                 return "not_graspable", f"{task.target} does not fit into the hand; what does: {', '.join(targets)}"
+        if lack := self._node.robot.lacks(task.needs_body):
+            return "not_able", f"{lack}; {task.name} needs one"
         if self._running is not None and not instead:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if stopped := self._estop.refusal:

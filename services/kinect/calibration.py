@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, CodeArray, Float32Array, FloatArray, ImageArray
-from cocoro.description import LensValues
+from cocoro.description_limbs import LensValues
 from cocoro.errors import CocoroError
 from cocoro.robot import Robot
 from cocoro.units import Vec3

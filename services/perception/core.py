@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from cocoro.arrays import Float32Array, FloatArray
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.history import History
@@ -92,7 +94,7 @@ class PerceptionCore:
 
     def _remember(self, state: ServoState) -> None:
         angles = dict(zip(state.joints, state.position_rad, strict=True))
-        if all(joint in angles for joint in self._localiser.joints):
+        if self._localiser.joints and all(joint in angles for joint in self._localiser.joints):
             head = [angles[joint] for joint in self._localiser.joints]
             self._head.add(state.stamp_ns, head, state.incarnation)
 
@@ -119,7 +121,7 @@ class PerceptionCore:
         outputs = []
         while self._pending:
             pending = self._pending[0]
-            angles = self._head.at(pending.stamp_ns, self._max_gap_ns)
+            angles = self._head_at(pending.stamp_ns)
             if angles is None and self._may_still_come(pending, now_ns):
                 break
             self._pending.popleft()
@@ -127,6 +129,11 @@ class PerceptionCore:
             if angles is not None and pending.floor_depth_m is not None:
                 outputs.append(Output(OBSTACLES, self._scanned(pending, angles)))
         return outputs
+
+    def _head_at(self, stamp_ns: int) -> FloatArray | None:
+        """The angles of the head's joints at a time, rad; None where they are not known. A camera that is fixed on the
+        body has none, and they are always known."""
+        return self._head.at(stamp_ns, self._max_gap_ns) if self._localiser.joints else np.zeros(0)
 
     def _floor_due(self, stamp_ns: int) -> bool:
         """The first frame of each period by the clock: which frames these are does not depend on earlier ones for
@@ -152,13 +159,14 @@ class PerceptionCore:
         if angles is None:
             self.unlocalised_frames += 1
         head = dict(zip(self._localiser.joints, angles.tolist(), strict=True)) if angles is not None else {}
+        pan_rad, tilt_rad = (head[name] for name in self._robot.head_joints) if head else (None, None)
         return Detections(
             stamp_ns=pending.stamp_ns,
             frame_seq=pending.frame_seq,
             frame_incarnation=pending.frame_incarnation,
             width=pending.camera.width,
             height=pending.camera.height,
-            pan_rad=head.get(self._robot.head.pan),
-            tilt_rad=head.get(self._robot.head.tilt),
+            pan_rad=pan_rad,
+            tilt_rad=tilt_rad,
             detections=tuple(self._localiser.locate(pending.sightings, pending.camera, angles)),
         )

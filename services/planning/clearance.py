@@ -20,6 +20,11 @@ _ALONG_FINGER = np.array([[0.0], [0.5], [1.0]])
 """Places of a finger's balls, as shares of its length."""
 
 
+def from_box_m(centres: FloatArray, radii: FloatArray, box: FloatArray) -> float:
+    """The least distance, m, of balls from a box of two corners (2, 3)."""
+    return float((np.linalg.norm(centres - np.clip(centres, box[0], box[1]), axis=1) - radii).min())
+
+
 class Clearance:
     """The hull of one robot, and its distances."""
 
@@ -33,12 +38,11 @@ class Clearance:
         radii = [tube.radius_m for tube in hull.tube for _ in range(tube.balls)]
         self._radii = np.array(radii + [hull.finger_radius_m] * (len(_ALONG_FINGER) * len(self._fingers)))
         self._tree = robot.tree(*(name for tube in hull.tube for name in (tube.start, tube.end)), *self._fingers)
-        self._mount_min = np.array(robot.kinect.mount_min_m)
-        self._mount_max = np.array(robot.kinect.mount_max_m)
+        self._mount = None if robot.kinect.mount is None else np.array(robot.kinect.mount)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
         self._chassis_top_m = robot.base.chassis_height_m + ON_CHASSIS_M
-        first = robot.link_of(robot.arm.roll)
-        hand = [tube.start == first for tube in hull.tube for _ in range(tube.balls)]
+        on_hand = [robot.arm.roll in robot.chain(tube.start).joints for tube in hull.tube]
+        hand = [on for on, tube in zip(on_hand, hull.tube, strict=True) for _ in range(tube.balls)]
         self.on_hand: BoolArray = np.array(hand + [True] * (len(self._radii) - len(hand)))
         """Which of the hull's balls belong to the hand, shape (n,)."""
         self._beyond_chassis = hull.tube[0].balls
@@ -65,10 +69,9 @@ class Clearance:
         `angles`: as for `hull`.
         """
         centres, radii = self.hull(angles)
-        nearest = np.clip(centres, self._mount_min, self._mount_max)
-        mount = np.linalg.norm(centres - nearest, axis=1) - radii
         floor = centres[:, 2] - radii
         over = np.maximum(np.hypot(centres[:, 0], centres[:, 1]) - self._chassis_radius_m, 0.0)
         above = np.maximum(centres[:, 2] - self._chassis_top_m, 0.0)
         chassis = (np.hypot(over, above) - radii)[self._beyond_chassis :]
-        return float(min(mount.min(), floor.min(), chassis.min()))
+        least_m = float(min(floor.min(), chassis.min()))
+        return least_m if self._mount is None else min(least_m, from_box_m(centres, radii, self._mount))

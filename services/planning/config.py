@@ -54,6 +54,8 @@ class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tilt_range_rad: tuple[float, float] = (-1.2, 0.5)
     """Below it the camera sees the robot itself, and its housing comes near the mount."""
     fixate_speed_radps: Positive = 4.0
+    body_turn_radps: Positive = 0.9
+    """Greatest rate at which the base turns to look about, on a robot whose camera is fixed on the body."""
     look_where_it_was_s: Positive = 1.5
     """Time for which a remembered object is looked for at its place before a sweep."""
 
@@ -109,6 +111,8 @@ class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stuck_s: Positive = 8.0
     glance_s: Positive = 1.5
     """Time after which a place ahead that stays hidden counts as seen."""
+    blind_mps: Positive = 0.12
+    """Speed over unseen floor that is too near to be seen by a camera that is fixed on the body."""
     distance_tolerance_m: Positive = 0.012
     heading_tolerance_rad: Positive = 0.05
     turn_gain_per_s: Positive = 3.0
@@ -168,6 +172,8 @@ class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     speed_radps: Positive = 1.2
     grip_load: Positive = 0.25
     """Closing load, as a share of the stall torque, at which a stopped claw counts as holding something."""
+    fixed_finger_room_m: Positive = 0.010
+    """With one jaw: what the fixed finger leaves between itself and the target as the hand closes in."""
     settle_s: Positive = 0.25
     give_up_s: Positive = 2.0
 

@@ -45,7 +45,8 @@ class PlanningCore:
         self._ended: Plan | None = None
         self._last_ns: int | None = None
         self._missing_since_ns: int | None = None
-        self._head_goal: tuple[float, float] | None = None
+        self._looks_to: tuple[float, float] | None = None
+        """Goal of the neck, where there is one."""
         self._floor_plan = FloorPlanner()
 
         self.learned = Learned(robot, config)
@@ -208,7 +209,7 @@ class PlanningCore:
         """Command nothing, so that the hardware stops by itself. The claws' goals stay: the last ones may have been
         lost on their way."""
         self.actuators.driver.reset()
-        self._head_goal = None
+        self._looks_to = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
         failed = (
@@ -253,15 +254,16 @@ class PlanningCore:
         base: BaseCommand = plan.base
         step: ArmStep = plan.arm
         if plan.head is not None:
-            self._head_goal = plan.head[:2]
-        if self._head_goal is None:
-            self._head_goal = snapshot.head_rad
+            self._looks_to = plan.head[:2]
+        if self._looks_to is None:
+            self._looks_to = snapshot.looks_rad
         head_speed = plan.head[2] if plan.head is not None else 1.0
-        robot = self.actuators.robot
+        neck = self.actuators.gaze.joints
+        looks_to = self._looks_to if neck else ()
         arm = ServoCommand(
-            joints=(robot.head.pan, robot.head.tilt, *robot.arm.joints),
-            goal_rad=(*self._head_goal, *(float(angle) for angle in step.goal_rad)),
-            speed_radps=(head_speed, head_speed, *(float(speed) for speed in step.speed_radps)),
+            joints=(*neck, *self.actuators.robot.arm.joints),
+            goal_rad=(*looks_to, *(float(angle) for angle in step.goal_rad)),
+            speed_radps=(*(head_speed for _ in neck), *(float(speed) for speed in step.speed_radps)),
         )
         hand = self.actuators.grip.command(step.roll_rad)
         return [

@@ -21,6 +21,7 @@ from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.escape import Escape
 from services.planning.floor_plan import Way
+from services.planning.gaze import gaze_of
 from services.planning.navigation import Driver, Offset, offset_to
 from services.planning.surroundings import Fields, Surroundings, placed
 
@@ -78,9 +79,8 @@ class Course:
         self._swing = swing_m
         self._serves = serves or (lambda pose: True)
         self._config = config.navigation
-        self._aim_m = aim_m
+        self._aim_m, self._arrive_m = aim_m, arrive_m
         self._arm_out = arm == "out"
-        self._arrive_m = arrive_m
         self._stretch_m = 0.0 if arm == "folded" else self._config.last_stretch_m
         self._body_m = robot.base.chassis_diameter_m / 2
         # Footprint of the hand with open claws along the arm's line in front of the robot.
@@ -95,6 +95,7 @@ class Course:
         self.walled = False
         """The newest plan found no way: neither is the arc free nor is there a detour."""
         self._escape = Escape(self._body_m, self._config.clearance_m)
+        self._blind_m = gaze_of(robot, config.head).nearest_m
 
     def step(
         self,
@@ -305,14 +306,7 @@ class Course:
         hidden = around.unseen(near) if len(near) else np.zeros(0, dtype=bool)
         if hidden.any():
             x, y = near[int(np.flatnonzero(hidden)[0])].tolist()
-            if self._glance is None or hypot(self._glance[0][0] - x, self._glance[0][1] - y) > 0.1:
-                self._glance = (x, y), now_ns
-            if now_ns - self._glance[1] > self._config.glance_s * NS:
-                # Something hides the place, and no obstacle was seen there.
-                around.floor.pass_over((x, y))
-            move = move._replace(look_at=(x, y))
-            if hypot(x - body.x_m, y - body.y_m) < 0.55 and move.speed_mps > 0:
-                move = move._replace(speed_mps=0.0, why=f"looking where to go; {move.why}")
+            move = self._over_unseen(move, (x, y), hypot(x - body.x_m, y - body.y_m), around, now_ns)
         careful = self.careful(move, body, fields, driver)
         if careful.speed_mps == 0.0 and move.speed_mps != 0.0 and self._planned_ns is not None:
             self._planned_ns = min(self._planned_ns, now_ns - _REPLAN_NS // 2)
@@ -328,6 +322,23 @@ class Course:
             self._stuck_since_ns = now_ns
         elif (now_ns - self._stuck_since_ns) / NS > self._config.stuck_s:
             return move._replace(blocked=True, why="there is no free way")
+        return move
+
+    def _over_unseen(
+        self, move: Move, place: tuple[float, float], away_m: float, around: Surroundings, now_ns: int
+    ) -> Move:
+        """The move towards a place ahead that was not seen: the camera looks there first, where it can."""
+        if away_m < self._blind_m:
+            share = min(self._config.blind_mps / max(abs(move.speed_mps), 1e-6), 1.0)
+            why = f"slowly, for the floor just ahead was not seen; {move.why}" if share < 1.0 else move.why
+            return move._replace(speed_mps=share * move.speed_mps, why=why)
+        if self._glance is None or hypot(self._glance[0][0] - place[0], self._glance[0][1] - place[1]) > 0.1:
+            self._glance = place, now_ns
+        if now_ns - self._glance[1] > self._config.glance_s * NS:
+            around.floor.pass_over(place)  # something hides it, and no obstacle was seen there
+        move = move._replace(look_at=place)
+        if away_m < 0.55 and move.speed_mps > 0:
+            move = move._replace(speed_mps=0.0, why=f"looking where to go; {move.why}")
         return move
 
     def careful(self, move: Move, body: Pose2, fields: Fields, driver: Driver) -> Move:

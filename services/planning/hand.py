@@ -1,10 +1,25 @@
-"""The claws, moved together as one degree of freedom, and whether they hold something."""
+"""The claws, moved together as one degree of freedom, whether they hold something, and where the hand goes for it."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from cocoro.messages import ServoCommand, ServoState
 from cocoro.robot import Robot
 from services.planning.config import HandConfig
+
+
+def aside_m(robot: Robot, width_m: float, room_m: float) -> float:
+    """How far to the left of a thing's centre, m, the axis of a level hand goes that closes on it. Two jaws close about
+    their middle. A fixed finger goes half of the thing's width and some room beside its centre; the jaw then moves the
+    thing over."""
+    if robot.claw.fixed_pad_m is None:
+        return 0.0
+    level = dict.fromkeys(robot.joints, 0.0) | robot.poses["upright"] | {robot.arm.roll: robot.claw.level_roll_rad}
+    jaw, hand = (robot.chain(link).pose(level) for link in (robot.link_of(robot.jaws[0]), robot.arm.tip))
+    along = hand[:3, 2]
+    left = np.array([-along[1], along[0], 0.0]) / max(float(np.hypot(along[0], along[1])), 1e-6)
+    return float((robot.claw.fixed_pad_m - width_m / 2 - room_m) * (jaw[:3, 0] @ left))
 
 
 class Grip:
@@ -62,18 +77,17 @@ class Grip:
             speeds.append(self._config.speed_radps)
         return ServoCommand(joints=tuple(joints), goal_rad=tuple(goals), speed_radps=tuple(speeds))
 
-    def opening(self, hand: ServoState) -> tuple[float, float]:
-        """The opening angles of both claws, radians, from the measured positions."""
+    def opening(self, hand: ServoState) -> tuple[float, ...]:
+        """The opening angle of each jaw, radians, from the measured positions."""
         place = dict(zip(hand.joints, hand.position_rad, strict=True))
-        left, right = (self._opens[name] * place[name] for name in self._jaws)
-        return left, right
+        return tuple(self._opens[name] * place[name] for name in self._jaws)
 
     def opened(self, hand: ServoState) -> bool:
         return min(self.opening(hand)) > self._config.open_rad - 0.08
 
     def feel(self, hand: ServoState, now_ns: int) -> None:
         """Take a measurement: a grip counts once it has lasted `settle_s`."""
-        if self._pressed(hand) and sum(self.opening(hand)) > 2 * (0.06 - self._config.close_rad):
+        if self._pressed(hand) and sum(self.opening(hand)) > len(self._jaws) * (0.06 - self._config.close_rad):
             if self._held_since_ns is None:
                 self._held_since_ns = now_ns
         else:
@@ -84,7 +98,7 @@ class Grip:
         return self._held_since_ns is not None and (now_ns - self._held_since_ns) / 1e9 >= self._config.settle_s
 
     def _pressed(self, hand: ServoState) -> bool:
-        """Whether both claws push inwards without closing; they may swing together."""
+        """Whether all jaws push inwards without closing; two may swing together."""
         loads = dict(zip(hand.joints, hand.load, strict=True))
         speeds = dict(zip(hand.joints, hand.speed_radps, strict=True))
         pushing = all(-self._opens[name] * loads[name] >= self._config.grip_load for name in self._jaws)

@@ -1,8 +1,8 @@
-"""The head: it sweeps to search and fixates what is seen; the floor that its mount hides; its camera's tilt error."""
+"""What a camera is turned to: the aims of a search, the floor that is hidden from it; and its tilt error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import atan2, ceil, cos, hypot, sin
 from typing import NamedTuple
 
@@ -17,69 +17,21 @@ _MOUNT_M = 0.01
 """Margin about the camera's mount."""
 
 
-class Gaze:
-    """Computes the pan and tilt that bring a point into the centre of the image."""
+class Aim(NamedTuple):
+    """What the camera is turned to: pan and tilt, rad, and the speed, rad/s."""
 
-    def __init__(self, robot: Robot, config: HeadConfig) -> None:
-        self._robot = robot
-        self._chain, self._head = robot.camera_chain, robot.head
-        self._limits = [robot.joints[robot.head.pan].limits_rad, config.tilt_range_rad]
-        kinect = robot.kinect
-        self._half_view = (
-            kinect.horizontal_fov_rad / 2 - config.view_margin_rad,
-            kinect.vertical_fov_rad / 2 - config.view_margin_rad,
-        )
-
-    def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
-        """(pan, tilt), rad, within the limits, for a point (x, y, z), body frame, metres.
-
-        Newton's method from the angles in `start` (derived): the neck's axes are nearly those of the image, so each
-        angle is corrected by its own image angle.
-        """
-        pan, tilt = start.get(self._head.pan, 0.0), start.get(self._head.tilt, 0.0)
-        point = np.array([*point_m, 1.0])
-        for _ in range(5):
-            pose = self._chain.pose(self._robot.head_angles(pan, tilt))
-            x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
-            if z < 1e-3:
-                # Behind the camera: first turn by the bearing, with a level camera.
-                pan, tilt = pan + atan2(-x, z), 0.0
-                continue
-            pan -= atan2(x, z * max(cos(tilt), 0.2))
-            tilt -= atan2(y, z)
-            tilt = min(max(tilt, self._limits[1][0]), self._limits[1][1])
-        (pan_min, pan_max), (tilt_min, tilt_max) = self._limits
-        pan = (pan + np.pi) % (2 * np.pi) - np.pi
-        return float(min(max(pan, pan_min), pan_max)), float(min(max(tilt, tilt_min), tilt_max))
-
-    def at_both(self, point_m: Vec3, others_m: Sequence[Vec3], start: Mapping[str, float]) -> tuple[float, float]:
-        """(pan, tilt), rad, for a picture that shows a point and, too, the first of the others that is near enough to
-        it."""
-        aim = self.at(point_m, start)
-        for other_m in others_m:
-            other = self.at(other_m, start)
-            if all(abs(b - a) / 2 <= half for a, b, half in zip(aim, other, self._half_view, strict=True)):
-                return (aim[0] + other[0]) / 2, (aim[1] + other[1]) / 2
-        return aim
+    pan_rad: float
+    tilt_rad: float
+    speed_radps: float
 
 
 class Sweep:
-    """Aims over the whole pan range at two tilts, for the far and the near floor. The head jumps from one to the next
-    and rests at each: a camera that turns blurs its picture, so a jump shows more in a second than a steady turn.
+    """Aims all around. The camera jumps from one to the next and rests at each: one that turns blurs its picture, so a
+    jump shows more in a second than a steady turn."""
 
-    It begins ahead, then looks to the nearer side, to the other side and round it, round the first side, and last at
-    the near floor.
-    """
-
-    def __init__(self, config: HeadConfig, pan_rad: float) -> None:
-        side = 1.0 if pan_rad >= 0 else -1.0
-        count = ceil(config.sweep_pan_rad / config.sweep_step_rad)
-        pans = [side * config.sweep_pan_rad * number / count for number in range(count + 1)]
-        far, near = config.sweep_tilts_rad
-        ahead, first, rest = pans[0], pans[1], pans[2:]
-        self._aims = [(ahead, config.middle_tilt_rad)]  # shows the floor that the robot would drive over first, too
-        self._aims += [(pan, far) for pan in (first, -first, *(-pan for pan in rest), *rest)]
-        self._aims += [(pan, near) for pan in (*reversed(pans), *(-pan for pan in pans[1:]))]
+    def __init__(self, aims: Sequence[tuple[float, float]]) -> None:
+        """`aims`: pan and tilt, rad, of each."""
+        self._aims = aims
         self._passed = 0
 
     @property
@@ -100,15 +52,27 @@ class Sweep:
         self._passed += 1
 
 
-class Glance(NamedTuple):
-    """The next aim of the head: pan and tilt, rad, and the speed, rad/s."""
+def neck_sweep(config: HeadConfig, pan_rad: float) -> Sweep:
+    """Over the whole pan range at two tilts, for the far and the near floor. It begins ahead, then looks to the nearer
+    side, to the other side and round it, round the first side, and last at the near floor."""
+    side = 1.0 if pan_rad >= 0 else -1.0
+    count = ceil(config.sweep_pan_rad / config.sweep_step_rad)
+    pans = [side * config.sweep_pan_rad * number / count for number in range(count + 1)]
+    far, near = config.sweep_tilts_rad
+    ahead, first, rest = pans[0], pans[1], pans[2:]
+    aims = [(ahead, config.middle_tilt_rad)]  # shows the floor that the robot would drive over first, too
+    aims += [(pan, far) for pan in (first, -first, *(-pan for pan in rest), *rest)]
+    aims += [(pan, near) for pan in (*reversed(pans), *(-pan for pan in pans[1:]))]
+    return Sweep(aims)
 
-    pan_rad: float
-    tilt_rad: float
-    speed_radps: float
+
+def round_sweep(config: HeadConfig, pan_rad: float, tilt_rad: float) -> Sweep:
+    """Once all round at one tilt, counter-clockwise, from where the camera looks now."""
+    count = ceil(2 * np.pi / config.sweep_step_rad)
+    return Sweep([(pan_rad + 2 * np.pi * number / count, tilt_rad) for number in range(count)])
 
 
-def glances(config: HeadConfig, pan_rad: float, floor: FloatArray) -> list[Glance]:
+def neck_glances(config: HeadConfig, pan_rad: float, floor: FloatArray) -> list[Aim]:
     """The way of the head over parts of the floor: bearings, rad, and distances, m, of places (n, 2), body frame.
 
     It passes slowly over the parts and fast between them, at one tilt, or where floor near the robot is wanted at two.
@@ -118,21 +82,29 @@ def glances(config: HeadConfig, pan_rad: float, floor: FloatArray) -> list[Glanc
     rows = [(far, floor[floor[:, 1] >= config.middle_m[1]]), (near, floor[floor[:, 1] < config.middle_m[1]])]
     if not close.any():
         rows = [(config.middle_tilt_rad, floor)]
-    way: list[Glance] = []
+    return glances(config, pan_rad, rows, config.sweep_pan_rad)
+
+
+def glances(
+    config: HeadConfig, pan_rad: float, rows: Sequence[tuple[float, FloatArray]], limit_rad: float
+) -> list[Aim]:
+    """The way of the camera over the floor's parts, each row at its tilt: slowly over the parts and fast between them.
+    `limit_rad`: the greatest pan to both sides."""
+    way: list[Aim] = []
     for tilt, places in rows:
         if not len(places):
             continue
-        parts = _parts(np.sort(places[:, 0]), config)
+        parts = _parts(np.sort(places[:, 0]), config, limit_rad)
         last = way[-1].pan_rad if way else pan_rad
         if abs(parts[0][0] - last) > abs(parts[-1][1] - last):
             parts = [(end, begin) for begin, end in reversed(parts)]
         for begin, end in parts:
-            way.append(Glance(begin, tilt, config.between_speed_radps))
-            way.append(Glance(end, tilt, config.sweep_speed_radps))
+            way.append(Aim(begin, tilt, config.between_speed_radps))
+            way.append(Aim(end, tilt, config.sweep_speed_radps))
     return way
 
 
-def _parts(bearings_rad: FloatArray, config: HeadConfig) -> list[tuple[float, float]]:
+def _parts(bearings_rad: FloatArray, config: HeadConfig, limit: float) -> list[tuple[float, float]]:
     """First and last pan, rad, for each group of bearings (n,), sorted."""
     groups = np.split(bearings_rad, np.flatnonzero(np.diff(bearings_rad) > 2 * config.view_rad) + 1)
     parts = []
@@ -140,24 +112,22 @@ def _parts(bearings_rad: FloatArray, config: HeadConfig) -> list[tuple[float, fl
         low, high = float(group[0]) + config.view_rad, float(group[-1]) - config.view_rad
         if low > high:
             low = high = (low + high) / 2
-        limit = config.sweep_pan_rad
         parts.append((min(max(low, -limit), limit), min(max(high, -limit), limit)))
     return parts
 
 
 class CameraTilt:
-    """Corrects positions that were computed with the nominal neck for a camera that is tilted against it.
+    """Corrects positions that were computed with the nominal neck, or the nominal mounting of a fixed camera, for a
+    camera that is tilted against it.
 
-    A camera that is tilted too far up sees everything as if the room were turned about the neck's tilt axis: far things
+    A camera that is tilted too far up sees everything as if the room were turned about its tilt axis: far things
     too high, and things below it too far away. The first shows the angle, the second disturbs driving by sight
     (derived). All positions are in the body frame, metres.
     """
 
     def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
-        """`tilt_rad`: the angle at the neck by which things are seen higher than they are."""
-        self._axis_x_m, _, self._axis_z_m = (
-            robot.chain(robot.link_of(robot.head.tilt)).position(robot.head_angles()).tolist()
-        )
+        """`tilt_rad`: the angle by which things are seen higher than they are."""
+        self._axis_x_m, _, self._axis_z_m = robot.chain(robot.camera_pivot).position(robot.head_angles()).tolist()
         self.tilt_rad = tilt_rad
 
     def straight(self, seen_m: Vec3) -> Vec3:
@@ -185,20 +155,21 @@ class CameraTilt:
         return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)
 
 
-def behind_mount(robot: Robot, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
-    """Mark the places on the floor, by bearing, rad, and distance, m, each (n,), body frame, that the mount hides from
-    a camera that pans to them (slabs, Kay and Kajiya 1986); returns shape (n,)."""
-    kinect, (low, high) = robot.kinect, robot.joints[robot.head.pan].limits_rad
-    pan = np.clip(bearing_rad, low, high)
-    links = robot.link_of(robot.head.tilt), robot.kinect.link
-    neck, camera = (robot.chain(link).position(robot.head_angles()) for link in links)
+def behind_mount(robot: Robot, pan_rad: FloatArray, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
+    """Mark the places on the floor, by bearing, rad, and distance, m, body frame, that the mount hides from a camera
+    with its neck at a pan, rad, each (n,) (slabs, Kay and Kajiya 1986); returns shape (n,)."""
+    if robot.kinect.mount is None:
+        return np.zeros(len(bearing_rad), dtype=bool)
+    low_m, high_m = robot.kinect.mount
+    neck, camera = (robot.chain(link).position(robot.head_angles()) for link in (robot.camera_pivot, robot.kinect.link))
     ahead_m = camera[0] - neck[0]
     eye = np.stack(
-        [neck[0] + ahead_m * np.cos(pan), neck[1] + ahead_m * np.sin(pan), np.full(len(pan), camera[2])], axis=1
+        [neck[0] + ahead_m * np.cos(pan_rad), neck[1] + ahead_m * np.sin(pan_rad), np.full(len(pan_rad), camera[2])],
+        axis=1,
     )
     place = distance_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad), 0 * bearing_rad], axis=1)
     way = np.where(np.abs(place - eye) < 1e-9, 1e-9, place - eye)
-    one = (np.array(kinect.mount_min_m) - _MOUNT_M - eye) / way
-    other = (np.array(kinect.mount_max_m) + _MOUNT_M - eye) / way
+    one = (np.array(low_m) - _MOUNT_M - eye) / way
+    other = (np.array(high_m) + _MOUNT_M - eye) / way
     hidden: BoolArray = np.minimum(one, other).max(axis=1) < np.maximum(one, other).min(axis=1)
     return hidden

@@ -196,7 +196,7 @@ class Learned:
         self.map = learned
         if learned is not None:
             self.hand = SeenHand(LearnedHand(self._robot, learned), learned, self._config.sight)
-        elif self._config.see_hand:
+        elif self._config.see_hand and self._robot.marker is not None:
             self.hand = SeenHand(self._robot.chain(self._robot.arm.tip), NominalModel(self._robot), self._config.sight)
         else:
             self.hand = None

@@ -9,7 +9,8 @@ import scipy  # loads its parts lazily: `scipy.stats` takes half a second
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
-from services.planning.clearance import Clearance
+from services.planning.clearance import Clearance, from_box_m
+from services.planning.gaze import Gaze
 
 RANGE_RAD = 2.62
 """The paper's range of each joint."""
@@ -24,18 +25,21 @@ OWN_ARM_M = 0.02
 class Postures:
     """Judges postures (4,), rad, of the arm's joints in their order, with the hand level."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, gaze: Gaze) -> None:
+        """Raises ConfigError for a robot without a marker."""
         self._joints, self._roll = robot.arm.joints, robot.arm.roll
         limits = np.array([robot.joints[name].limits_rad for name in self._joints])
         self.ranges = np.clip(limits, -RANGE_RAD, RANGE_RAD)
         self._clearance = Clearance(robot)
         hull = robot.hull
         self._from_upper_arm_m = hull.tube[0].radius_m + OWN_ARM_M
-        self._kinect_min, self._kinect_max = np.array(hull.kinect_min_m), np.array(hull.kinect_max_m)
+        self._kinect = None if hull.kinect is None else np.array(hull.kinect)
         self._roll_rad = robot.claw.level_roll_rad
         self._upper = robot.chain(hull.tube[0].start), robot.chain(hull.tube[0].end)
         self._head = robot.camera_chain.position(robot.head_angles())
-        self._marker = robot.chain(robot.marker.link), np.array([*robot.marker.position_m, 1.0])
+        marker = robot.the_marker
+        self._marker = robot.chain(marker.link), np.array([*marker.position_m, 1.0])
+        self._gaze = gaze
         self._nearest_m = robot.kinect.min_range_m
 
     def marker_m(self, angles: Mapping[str, float]) -> tuple[float, float, float]:
@@ -50,8 +54,7 @@ class Postures:
         if self._clearance.of(angles) < MARGIN_M:
             return False
         centres, radii = self._clearance.hull(angles)
-        apart = np.linalg.norm(centres - np.clip(centres, self._kinect_min, self._kinect_max), axis=1) - radii
-        if float(apart.min()) < MARGIN_M:
+        if self._kinect is not None and from_box_m(centres, radii, self._kinect) < MARGIN_M:
             return False
         shoulder, elbow = (chain.position(angles) for chain in self._upper)
         along = elbow - shoulder
@@ -62,13 +65,18 @@ class Postures:
         return float(away.min()) > self._from_upper_arm_m
 
     def seeable(self, posture: FloatArray) -> bool:
-        """Whether the camera might see the marker: not too near, and not hidden by the hand (nominal model)."""
+        """Whether the camera might see the marker: in the picture, not too near, and not hidden by the hand (nominal
+        model)."""
         chain, marker = self._marker
         pose = chain.pose(self._angles(posture))
-        to_camera = self._head - (pose @ marker)[:3]
+        place = (pose @ marker)[:3]
+        to_camera = self._head - place
         distance_m = float(np.linalg.norm(to_camera))
         # The link's y points from the roll axis to the marker.
-        return distance_m > self._nearest_m and float(pose[:3, 1] @ to_camera) > -0.1 * distance_m
+        if distance_m <= self._nearest_m or float(pose[:3, 1] @ to_camera) <= -0.1 * distance_m:
+            return False
+        x, y, z = place.tolist()
+        return self._gaze.shows((x, y, z))
 
     def clear_way(self, start: FloatArray, end: FloatArray) -> bool:
         """Whether all postures on the straight path in joint space are safe; the start need not be."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from math import asin
 from typing import NamedTuple
 
 import numpy as np
@@ -195,17 +196,22 @@ class Reachability:
                 return radius
         return config.retreat_radius_m
 
-    def grasp(self, target_m: Vec3) -> Grasp:
-        """The hand poses for a target's centre (x, y, z), body frame, metres, reachable or not."""
+    def grasp(self, target_m: Vec3, aside_m: float = 0.0) -> Grasp:
+        """The hand poses for a target's centre (x, y, z), body frame, metres, reachable or not. `aside_m`: how far to
+        its left the hand's axis goes."""
         config = self._config
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
+        if aside_m != 0.0:
+            azimuth += asin(min(max(aside_m / max(radius, 1e-6), -1.0), 1.0))
+            radius = max(radius**2 - aside_m**2, 0.0) ** 0.5
         low, high = config.grasp_height_range_m
         height = min(max(height, low), high)
         behind = HandPose(self.retreat_m, azimuth, height, config.pitch_rad)
         return Grasp(behind, behind._replace(radius_m=radius))
 
-    def why_not(self, target_m: Vec3, *, touching: bool = False) -> str:
-        """The reason for which a target cannot be grasped (or `touching`: touched) from here; '' when it can."""
+    def why_not(self, target_m: Vec3, aside_m: float = 0.0, *, touching: bool = False) -> str:
+        """The reason for which a target cannot be grasped (or `touching`: touched) from here; '' when it can.
+        `aside_m`: as for `grasp`."""
         config = self._config
         radius_range_m = config.touch_radius_range_m if touching else config.grasp_radius_range_m
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
@@ -217,7 +223,7 @@ class Reachability:
                 return f"its {name} is {value:.2f} {unit}, reachable is {low:.2f} to {high:.2f}"
         if height > config.grasp_height_range_m[1]:
             return f"it is {height:.2f} m high, reachable is up to {config.grasp_height_range_m[1]:.2f}"
-        grasp = self.grasp(target_m)
+        grasp = self.grasp(target_m, aside_m)
         turn = self._reacher.azimuth
         start = self._upright | {turn: self._upright[turn] + azimuth}
         around = self._reacher.solve(start, grasp.around)

@@ -21,7 +21,7 @@ from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from services.planning.config import SearchConfig
 from services.planning.floor_map import CELL_M, SIZE, FloorMap, overlap
-from services.planning.head import behind_mount
+from services.planning.gaze import Gaze
 from services.planning.wall_feet import ANYWHERE, own_sides, sector
 
 _STRETCH_BYTES = 6
@@ -80,11 +80,10 @@ class Rest(NamedTuple):
 class SeenFloor:
     """The seen floor of one search. Arrays have the shape (SIZE, SIZE), rows along x, and stay where they began."""
 
-    def __init__(self, config: SearchConfig, robot: Robot) -> None:
-        self._config = config
-        self._robot = robot
-        self._count = np.zeros((SIZE, SIZE), dtype=np.int8)
-        self._missed = np.zeros((SIZE, SIZE), dtype=np.int8)
+    def __init__(self, config: SearchConfig, robot: Robot, gaze: Gaze) -> None:
+        self._config, self._gaze = config, gaze
+        self._body_m, self._sight_m = robot.base.chassis_diameter_m / 2, min(config.sight_m, gaze.farthest_m)
+        self._count, self._missed = (np.zeros((SIZE, SIZE), dtype=np.int8) for _ in range(2))
         self._from = np.zeros((SIZE, SIZE), dtype=np.int64)
         """The sectors (bits) from which a cell was seen."""
         self._feet = False
@@ -159,7 +158,7 @@ class SeenFloor:
     def stand_at(self, body: Pose2) -> None:
         """Count the floor under the body as seen."""
         if self.running:
-            self._count[self._disc(body.x_m, body.y_m, self._robot.base.chassis_diameter_m / 2)] = _ENOUGH
+            self._count[self._disc(body.x_m, body.y_m, self._body_m)] = _ENOUGH
 
     def looked_from(self, body: Pose2, around: FloorMap, known: Sequence[tuple[float, ...]]) -> None:
         """Note that everything that can be seen from a pose was looked at; what is still unseen may stay hidden."""
@@ -178,17 +177,17 @@ class SeenFloor:
         return self._hidden(around, known) & (self._missed < _PATIENCE)
 
     def shown(self, body: Pose2, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
-        """The unseen floor that the head should see from a pose of the body; the camera's mount hides some."""
+        """The unseen floor that the camera should see when it looks about from a pose of the body."""
         cells = self.visible((body.x_m, body.y_m), around, known)
         rows, columns = np.nonzero(cells)
         bearing, distance = self.bearings(cells, body).T
-        cells[rows, columns] = ~behind_mount(self._robot, bearing, distance)
+        cells[rows, columns] = ~self._gaze.hides(bearing, distance)
         return cells
 
     def visible(self, place_m: tuple[float, float], around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
         """The unseen floor that should be visible from a place, odometry frame, however the robot stands there."""
         bearings = np.linspace(0.0, 2 * np.pi, _FINE_RAYS, endpoint=False)
-        steps = np.arange(CELL_M, self._config.sight_m, CELL_M)
+        steps = np.arange(CELL_M, self._sight_m, CELL_M)
         flat, shown = self._cast(np.array([place_m], dtype=np.float64), bearings, steps, self._things(around, known))
         wanted = self._wanted(around, known).reshape(-1)[flat] & (1 << sector(bearings + np.pi))[:, None] > 0
         cells = np.zeros(SIZE * SIZE, dtype=bool)
@@ -228,7 +227,7 @@ class SeenFloor:
         rows, columns = np.nonzero(grid)
         places = np.asarray((np.stack([rows, columns], axis=1) + self._corner + 0.5) * CELL_M)
         bearings = np.linspace(0.0, 2 * np.pi, _RAYS, endpoint=False)
-        steps = np.arange(_STEP_M, self._config.sight_m, _STEP_M)
+        steps = np.arange(_STEP_M, self._sight_m, _STEP_M)
         flat, shown = self._cast(places, bearings, steps, self._things(around, known))
         # The mount hides what is near, except ahead.
         share = np.where(steps < _NEAR_M, _NEAR_SHARE, 1.0) * steps * (2 * np.pi / _RAYS) * _STEP_M
@@ -342,8 +341,10 @@ class SeenFloor:
         flat = self._flat(x, y)
         opaque = cv2.dilate(things.astype(np.uint8), np.ones((2 * _OPAQUE_CELLS + 1,) * 2, np.uint8)).reshape(-1) > 0
         stopped = np.logical_or.accumulate(opaque[flat] | (flat < 0), axis=-1)
-        unknown = np.cumsum((self._count.reshape(-1) < _ENOUGH)[flat], axis=-1) * float(steps_m[1] - steps_m[0])
-        return flat, ~stopped & (unknown <= self._config.margin_m) & (steps_m >= _NEAREST_M)
+        unseen = (self._count.reshape(-1) < _ENOUGH)[flat] & (steps_m >= self._gaze.nearest_m)
+        unknown = np.cumsum(unseen, axis=-1) * float(steps_m[1] - steps_m[0])
+        far_enough = steps_m >= max(_NEAREST_M, self._gaze.nearest_m)
+        return flat, ~stopped & (unknown <= self._config.margin_m) & far_enough
 
     def _flat(self, x_m: FloatArray, y_m: FloatArray) -> IntArray:
         rows = np.floor(x_m / CELL_M).astype(np.int64) - self._corner[0]
@@ -384,8 +385,7 @@ def describe(rest: Rest, body: Pose2) -> str:
 
 
 def _side(bearing_deg: float) -> str:
-    side = "left" if bearing_deg > 0 else "right"
-    away = abs(bearing_deg)
+    side, away = "left" if bearing_deg > 0 else "right", abs(bearing_deg)
     if away < 22.5:
         return "ahead"
     if away > 157.5:

@@ -24,13 +24,14 @@ from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import Solid, inside
+from services.planning.gaze import gaze_of
 from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
 from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
 from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
-from services.planning.surroundings import Surroundings
+from services.planning.surroundings import OBJECT_M, Surroundings
 from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
@@ -78,7 +79,8 @@ class StateEstimator:
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
-        self.seen = SeenFloor(config.search, robot)
+        self._gaze = gaze_of(robot, config.head)
+        self.seen = SeenFloor(config.search, robot, self._gaze)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self._localised_ns = 0
@@ -187,7 +189,7 @@ class StateEstimator:
                 turning_radps = self._turning_radps(seen.stamp_ns)
                 correct = self.seen.running or (on_way and self.matching.shift is not None)
                 if correct and turning_radps < _STEADY_RADPS:
-                    self._match(seen, odometry, hull, angles[self._robot.head.pan])
+                    self._match(seen, odometry, hull, self._gaze.on_body(angles)[0])
                 body = self.matching.place(odometry)
                 self.around.floor.enter(seen, body, hull, known, view)
                 self.seen.enter(seen, body, turning_radps, self.matching.doubt_m)
@@ -216,9 +218,9 @@ class StateEstimator:
         pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
         if angles is None or before is None or pose is None or pose_before is None:
             return inf
-        head = self._robot.head
-        pan = angles[head.pan] - before[head.pan] + float(pose[2] - pose_before[2])
-        return hypot(pan, angles[head.tilt] - before[head.tilt]) * NS / _GLIMPSE_NS
+        (pan, tilt), (pan_before, tilt_before) = self._gaze.on_body(angles), self._gaze.on_body(before)
+        turned = pan - pan_before + float(pose[2] - pose_before[2])
+        return hypot(turned, tilt - tilt_before) * NS / _GLIMPSE_NS
 
     def _solids(self, stamp_ns: int) -> list[Solid]:
         """The known objects that a frame shows, and where those are that were seen shortly before it."""
@@ -266,6 +268,11 @@ class StateEstimator:
             self._sightings.append(
                 PostureSighting(detection.label, stamp_ns, detection.position_m, detection.area_px, angles)
             )
+
+    def width_m(self, label: str) -> float:
+        """Width of a known object; of an unknown one that of the cans."""
+        item = self._known.get(label)
+        return 2 * (item.planar_radius_m if item is not None else OBJECT_M)
 
     def watch(self, label: str) -> None:
         """Keep the unfiltered sightings of a label, too."""

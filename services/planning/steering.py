@@ -9,6 +9,7 @@ from cocoro.messages import Motion
 from services.planning.arm import ArmStep
 from services.planning.caution import limited
 from services.planning.course import Course
+from services.planning.head import Aim
 from services.planning.reach import HandPose
 
 if TYPE_CHECKING:
@@ -125,20 +126,19 @@ class SteeredHead:
         self._used_ns: int | None = None
 
     def free(self, snapshot: Snapshot) -> bool:
-        """Whether the operator has left the head alone for a while."""
+        """Whether the operator has left a head alone for a while, so that it looks where it is told to."""
+        if not snapshot.actuators.gaze.joints:
+            return False  # the operator turns the base
         wait_ns = snapshot.actuators.config.by_hand.look_after_s * NS
         return self._used_ns is None or not 0 <= snapshot.now_ns - self._used_ns <= wait_ns
 
-    def step(
-        self, snapshot: Snapshot, motion: Motion, look_at: tuple[float, float] | None
-    ) -> tuple[float, float, float] | None:
-        """Pan and tilt, rad, and speed, rad/s; None leaves the head at its goal."""
+    def step(self, snapshot: Snapshot, motion: Motion, look_at: tuple[float, float] | None) -> Aim | None:
+        """What the neck turns the camera to; None leaves it at its goal."""
         actuators, config = snapshot.actuators, snapshot.actuators.config.by_hand
-        here = snapshot.head_rad
+        here, limits = snapshot.looks_rad, actuators.gaze.limits_rad
         if motion.head:
             self._used_ns = snapshot.now_ns
             start = self._goal or here
-            limits = actuators.robot.joints[actuators.robot.head.pan].limits_rad, actuators.config.head.tilt_range_rad
             rates = (limited(rate, config.head_radps) for rate in (motion.pan_radps, motion.tilt_radps))
             wanted = (angle + rate * snapshot.dt_s for angle, rate in zip(start, rates, strict=True))
             pan, tilt = (
@@ -146,10 +146,10 @@ class SteeredHead:
                 for angle, limit, at in zip(wanted, limits, here, strict=True)
             )
             self._goal = pan, tilt
-            return pan, tilt, _CATCH_UP * config.head_radps
+            return Aim(pan, tilt, _CATCH_UP * config.head_radps)
         if self._goal is not None:
             self._goal = None
-            return (*here, config.head_radps)
+            return Aim(*here, config.head_radps)
         if look_at is not None and self.free(snapshot):
             return snapshot.look_at(snapshot.body.inverse().apply((*look_at, 0.0)))
         return None

@@ -17,7 +17,7 @@ from services.planning.floor_plan import Way
 from services.planning.routes import Routes
 
 _KEEP_NS = NS // 10
-_OBJECT_M = 0.033
+OBJECT_M = 0.033
 """Radius with which an object of unknown size counts as an obstacle: that of the cans."""
 _SMEAR_M = 0.09
 """Margin by which the map may show an object wider than it is: cell size, depth noise, odometry drift."""
@@ -63,7 +63,7 @@ class Surroundings:
         stale = self._built is None or self._built[1] != label or now_ns - self._built_ns >= _KEEP_NS
         if self._fields is None or (stale and what != self._built):
             discs = {
-                item.label: (*item.odometry_position_m[:2], self._radii_m.get(item.label, _OBJECT_M))
+                item.label: (*item.odometry_position_m[:2], self._radii_m.get(item.label, OBJECT_M))
                 for item in known
                 if item.label != self._marker
             }
@@ -79,7 +79,7 @@ class Surroundings:
     def discs(self, known: Sequence[TargetEstimate]) -> tuple[tuple[float, float, float], ...]:
         """The floor (x, y, radius), odometry frame, metres, that known objects stand on."""
         return tuple(
-            (*item.odometry_position_m[:2], self._radii_m.get(item.label, _OBJECT_M))
+            (*item.odometry_position_m[:2], self._radii_m.get(item.label, OBJECT_M))
             for item in known
             if item.label != self._marker
         )

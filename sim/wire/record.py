@@ -107,12 +107,12 @@ def record(
 
 
 def _turn_head(world: World, pan_rad: float, tilt_rad: float) -> None:
-    joints = tuple(world.robot.head_angles())
+    head = world.robot.head_angles(pan_rad, tilt_rad)
     world.set_latch("released")
     while world.time_ns < TURN_NS:
         if world.time_ns < TURN_NS - NS // 2:  # afterwards it holds, and comes to rest
-            speeds = (1.5, 1.5)
-            goal = ServoCommand(stamp_ns=world.time_ns, joints=joints, goal_rad=(pan_rad, tilt_rad), speed_radps=speeds)
+            goals, speeds = tuple(head.values()), (1.5,) * len(head)
+            goal = ServoCommand(stamp_ns=world.time_ns, joints=tuple(head), goal_rad=goals, speed_radps=speeds)
             world.command_servos("arm", goal)
         world.step()
 

@@ -19,6 +19,7 @@ First = Annotated[
 class BabbleArmTask(Task, frozen=True, kw_only=True, tag="babble-arm"):
     """Move the arm about and look at the hand, then fold the arm."""
 
+    needs_body = ("marker",)
     samples = HAND_SAMPLES
 
     first: First = 0
@@ -36,6 +37,7 @@ class BabbleWheelsTask(Task, frozen=True, kw_only=True, tag="babble-wheels"):
     """Turn the wheels to and fro before an object that stands."""
 
     needs_label = "known"
+    needs_body = ("neck",)
     samples = WHEEL_TRIALS
 
     label: TargetLabel

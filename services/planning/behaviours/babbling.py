@@ -17,6 +17,7 @@ from cocoro.messages.actions import BabbleArm, BabbleWheels
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
+from services.planning.head import Aim
 from services.planning.postures import Postures, sobol
 from services.planning.reach import HandPose
 
@@ -36,6 +37,8 @@ class ArmBabbling:
     """Draws that are examined in one step; each takes up to a few milliseconds."""
     GIVE_UP = 60
     """Number of draws without a clear way after which the arm goes back."""
+    NOWHERE = 3000
+    """Number of draws without one, at home, after which the camera counts as one that never sees the marker."""
 
     def __init__(self, action: BabbleArm) -> None:
         self._first = first = action.first
@@ -53,8 +56,12 @@ class ArmBabbling:
         self._hitches = 0
 
     def step(self, snapshot: Snapshot) -> Plan:
+        actuators = snapshot.actuators
+        if actuators.robot.marker is None:
+            why = "the hand has no marker to look at"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_able")
         if self._postures is None:
-            self._postures = Postures(snapshot.actuators.robot)
+            self._postures = Postures(actuators.robot, actuators.gaze)
             self._draws = sobol(self._first, self._postures.ranges)
         if not self._trail:
             return self._unfold(snapshot)
@@ -62,6 +69,9 @@ class ArmBabbling:
         arm = snapshot.actuators.arm
         if self._goal is None:
             self._choose(snapshot)
+        if self._goal is None and self._looked > self.NOWHERE:
+            why = "the camera would see the marker in no posture that the arm can come to"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_able", reports=reports)
         if self._goal is None:
             step = snapshot.still()
         else:
@@ -193,6 +203,9 @@ class WheelBabbling:
         self._begun: Pose2 | None = None
 
     def step(self, snapshot: Snapshot) -> Plan:
+        if not snapshot.actuators.gaze.joints:
+            why = "the camera is fixed on the body, so it does not keep its target in sight while the wheels turn"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_able")
         self._begun = self._begun or snapshot.body
         kind = snapshot.actuators.robot.base.kind
         if kind != "differential":
@@ -225,7 +238,7 @@ class WheelBabbling:
             self._driving, self._phase_ns = False, None
         return BaseCommand(ahead_mps=0.0, turn_radps=0.0)
 
-    def _look_there(self, snapshot: Snapshot) -> tuple[float, float, float] | None:
+    def _look_there(self, snapshot: Snapshot) -> Aim | None:
         target = snapshot.target(self._label)
         return None if target is None else snapshot.look_at(target.position_m)
 
@@ -239,9 +252,9 @@ class WheelBabbling:
                 return plan
             self._gaze = gaze[:2]
             self._seen.clear()
-            plan.head = (gaze[0] + self.AWAY_RAD[0], gaze[1] + self.AWAY_RAD[1], 2.0)
+            plan.head = Aim(gaze[0] + self.AWAY_RAD[0], gaze[1] + self.AWAY_RAD[1], 2.0)
             return plan
-        plan.head = (*self._gaze, 2.0)
+        plan.head = Aim(*self._gaze, 2.0)
         if spent_s < self.AWAY_S + self.SETTLE_S:
             return plan
         self._seen.extend(places)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import hypot
+from math import hypot, inf
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -18,9 +18,10 @@ from cocoro.units import Vec3
 from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import FloorMap
-from services.planning.hand import Grip
-from services.planning.head import CameraTilt, Gaze
-from services.planning.navigation import Driver
+from services.planning.gaze import Gaze, gaze_of
+from services.planning.hand import Grip, aside_m
+from services.planning.head import Aim, CameraTilt
+from services.planning.navigation import GENTLE, Driver
 from services.planning.reach import HandPose, Reacher
 from services.planning.reachability import Reachability
 from services.planning.state_estimator import StateEstimator
@@ -58,7 +59,7 @@ class Actuators:
         self.reacher = Reacher(robot, config.arm.damping)
         self.arm = ArmController(robot, config.arm, self.reacher)
         self.grip = Grip(robot, config.hand)
-        self.gaze = Gaze(robot, config.head)
+        self.gaze = gaze_of(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
         self.camera_tilt = CameraTilt(robot)
@@ -93,10 +94,9 @@ class Snapshot:
     actuators: Actuators
 
     @property
-    def head_rad(self) -> tuple[float, float]:
-        """Pan and tilt."""
-        head = self.actuators.robot.head
-        return self.angles[head.pan], self.angles[head.tilt]
+    def looks_rad(self) -> tuple[float, float]:
+        """Where the camera looks: pan and tilt, as `services.planning.gaze` counts them."""
+        return self.actuators.gaze.direction(self.angles, self.body)
 
     def target(self, label: str) -> TargetEstimate | None:
         return self.estimator.memory.estimate(label, self.body, self.now_ns)
@@ -153,6 +153,25 @@ class Snapshot:
     def still(self) -> ArmStep:
         return self.actuators.arm.hold(self.angles, self.dt_s)
 
+    def fold(self) -> ArmStep:
+        return self.actuators.arm.park(self.angles, self.dt_s)
+
+    @property
+    def folded(self) -> bool:
+        """Whether the arm is folded."""
+        return self.actuators.arm.parked(self.angles)
+
+    @property
+    def turning_radps(self) -> float:
+        """Rate at which the base turns; infinite while that is not known."""
+        base = self.estimator.base
+        return base.turn_rate_radps if base is not None else inf
+
+    def turn(self, left_rad: float, most_radps: float) -> BaseCommand:
+        """Turn on the spot by the rest of an angle, at most so fast."""
+        rate = self.actuators.config.navigation.turn_gain_per_s * left_rad
+        return self.actuators.driver.command(0.0, min(max(rate, -most_radps), most_radps), self.dt_s, pace=GENTLE)
+
     AHEAD_M: ClassVar[float] = 0.55
 
     def floor_before(self, target: TargetEstimate) -> Vec3:
@@ -161,16 +180,31 @@ class Snapshot:
         share = min(self.AHEAD_M / max(planar_m(target), 1e-6), 1.0)
         return share * x, share * y, 0.0
 
+    def aside_m(self, label: str) -> float:
+        """How far to the left of a target's centre, m, the hand's axis goes to grasp it."""
+        room_m = self.actuators.config.hand.fixed_finger_room_m
+        return aside_m(self.actuators.robot, self.estimator.width_m(label), room_m)
+
     def at_rest(self, target: TargetEstimate) -> Vec3:
         """Where a target will be, body frame, m, when the robot has braked."""
         x, y, z = target.position_m
         return x - self.actuators.driver.coast_m, y, z
 
-    def look_at(self, point_m: Vec3, *others_m: Vec3) -> tuple[float, float, float]:
-        """Aim of the head, with its speed, for a point in the body frame, m, and for a picture that also shows the
+    def look_at(self, point_m: Vec3, *others_m: Vec3) -> Aim:
+        """Aim of the camera, with its speed, for a point in the body frame, m, and for a picture that also shows the
         first of the others that is near enough."""
-        pan, tilt = self.actuators.gaze.at_both(point_m, others_m, self.angles)
-        return pan, tilt, self.actuators.config.head.fixate_speed_radps
+        pan, tilt = self.actuators.gaze.at(point_m, others_m, self.angles, self.body)
+        return Aim(pan, tilt, self.actuators.config.head.fixate_speed_radps)
+
+    def looking(self, why: str, aim: Aim | None, distance_m: float | None = None) -> Plan:
+        """The plan of a robot that stands to look; one without a neck turns there, its arm folded."""
+        gaze = self.actuators.gaze
+        base, arm = gaze.turn(aim, self), gaze.arm(self)
+        plan = Plan(base, arm, why, aim, distance_m=distance_m)
+        if arm.blocked:
+            plan.base, plan.state, plan.reason = self.stand(), "failed", "blocked"
+            plan.why = "the arm's way to the park pose is blocked, and the base cannot turn to look before it is folded"
+        return plan
 
 
 @dataclass
@@ -180,8 +214,9 @@ class Plan:
     base: BaseCommand
     arm: ArmStep
     why: str
-    head: tuple[float, float, float] | None = None
-    """Pan and tilt, rad, and speed, rad/s; None leaves the head at the goal before."""
+    head: Aim | None = None
+    """What a neck turns the camera to; None leaves it at the goal before. A base that serves as the neck does what
+    `base` says (`Snapshot.looking`)."""
     state: State = "running"
     reason: str = ""
     distance_m: float | None = None

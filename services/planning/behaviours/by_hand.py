@@ -41,7 +41,7 @@ class DrivingByHand:
 
     def step(self, snapshot: Snapshot) -> Plan:
         actuators = snapshot.actuators
-        motion = snapshot.estimator.motion(snapshot.now_ns) or _REST
+        motion, why_not = actuators.gaze.steered(snapshot.estimator.motion(snapshot.now_ns) or _REST)
         caution = self._know(snapshot)
         fields = snapshot.fields(self._near_hand(snapshot))
         self._grip.step(snapshot, motion)
@@ -54,7 +54,7 @@ class DrivingByHand:
         else:
             base, allowed = self._base(snapshot, motion, caution, fields)
         head = self._head.step(snapshot, motion, self._hand.look_at or allowed.look_at)
-        why = "; ".join(filter(None, (allowed.why, self._hand.why))) or _what(motion, base)
+        why = "; ".join(filter(None, (allowed.why, self._hand.why, why_not))) or _what(motion, base)
         return Plan(base, arm, why, head)
 
     def _know(self, snapshot: Snapshot) -> Caution:

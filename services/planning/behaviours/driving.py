@@ -11,6 +11,7 @@ from cocoro.messages.actions import Approach, Carry
 from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
+from services.planning.head import Aim
 from services.planning.navigation import GENTLE, PREVIEW_S, offset_to
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
@@ -32,7 +33,7 @@ class BackOff:
         self._from: Pose2 | None = None
         self._bumps = 0
 
-    def step(self, snapshot: Snapshot, head: tuple[float, float, float]) -> Plan | None:
+    def step(self, snapshot: Snapshot, head: Aim) -> Plan | None:
         """The plan that backs off; None when there is no bump."""
         base = snapshot.estimator.base
         if base is not None and (base.bump_left or base.bump_right) and self._from is None:
@@ -213,7 +214,7 @@ class Approaching:
         fast = base is not None and abs(base.speed_mps) > actuators.config.navigation.coasting_mps
         swing_radps = config.swing_radps if fast else None
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
-            goal = actuators.reachability.grasp(target.position_m).behind
+            goal = actuators.reachability.grasp(target.position_m, snapshot.aside_m(self._label)).behind
             low, high = config.grasp_azimuth_range_rad
             goal = goal._replace(azimuth_rad=min(max(goal.azimuth_rad, low), high))
             have = actuators.reacher.pose({**angles, **reference})

@@ -17,6 +17,7 @@ from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
 from services.planning.config import FollowConfig
 from services.planning.course import Course, Move
+from services.planning.head import Aim
 from services.planning.navigation import GENTLE
 from services.planning.surroundings import Fields
 
@@ -152,7 +153,7 @@ class Following:
         return snapshot.estimator.around.sees((pose.x_m, pose.y_m, snapshot.actuators.camera_m), self._place_m)
 
     @staticmethod
-    def _look_down(snapshot: Snapshot, move: Move) -> tuple[float, float, float]:
+    def _look_down(snapshot: Snapshot, move: Move) -> Aim:
         assert move.look_at is not None
         return snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
 
@@ -181,7 +182,7 @@ class Following:
         patience_s = _LOOK_S + 2 * snapshot.estimator.sight_lag_s
         if snapshot.now_ns - self._looking_since_ns > patience_s * NS:
             return self._lost(snapshot, target)
-        return Plan(snapshot.stand(), arm, "lost it: looking where it was going", head, distance_m=off_m)
+        return snapshot.looking("lost it: looking where it was going", head, off_m)
 
     def _lost(self, snapshot: Snapshot, target: TargetEstimate) -> Plan:
         why = f"{self._label} has not been seen for {target.age_s:.0f} s"

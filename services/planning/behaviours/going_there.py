@@ -12,6 +12,7 @@ from cocoro.units import Vec3
 from services.planning.behaviours.base import Plan, Snapshot, State
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course, Move
+from services.planning.head import Aim
 from services.planning.surroundings import Fields
 
 
@@ -52,7 +53,9 @@ class GoingThere:
         stands = self._stands(snapshot, fields, move, self._course)
         if stands is not None:
             why, state, reason = stands
-            return Plan(snapshot.stand(), arm, why, head, state, reason, left_m)
+            looks = state == "running" and not move.arrived
+            base = actuators.gaze.turn(head, snapshot) if looks else snapshot.stand()
+            return Plan(base, arm, why, head, state, reason, left_m)
         if move.look_at is not None:
             head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
@@ -73,7 +76,7 @@ class GoingThere:
             return "folding the arm first", "running", ""
         return None
 
-    def _look(self, snapshot: Snapshot, place_m: Vec3) -> tuple[float, float, float]:
+    def _look(self, snapshot: Snapshot, place_m: Vec3) -> Aim:
         x, y, _ = place_m
         share = min(self.FLOOR_M / max(hypot(x, y), 1e-6), 1.0)
         return snapshot.look_at(place_m, (share * x, share * y, 0.0))

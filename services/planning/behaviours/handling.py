@@ -38,14 +38,15 @@ class Reaching:
         ):
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
-            why_not = actuators.reachability.why_not(snapshot.at_rest(target), touching=self._touching)
+            aside_m = snapshot.aside_m(self._label)
+            why_not = actuators.reachability.why_not(snapshot.at_rest(target), aside_m, touching=self._touching)
             if why_not:
                 return Plan(snapshot.stand(), snapshot.still(), why_not, None, "failed", "unreachable")
         actuators.grip.open()
         grasp = self._frozen
         if grasp is None:
             assert target is not None
-            grasp = actuators.reachability.grasp(snapshot.at_rest(target))
+            grasp = actuators.reachability.grasp(snapshot.at_rest(target), snapshot.aside_m(self._label))
         head = snapshot.look_at(target.position_m) if target is not None else None
         closing_in = self._inserting
         if not closing_in:
@@ -71,7 +72,7 @@ class Reaching:
 
 
 class Closing:
-    """Closes both claws together until something stops them (the paper's one degree of freedom)."""
+    """Closes the jaws together until something stops them (the paper's one degree of freedom)."""
 
     needs_sight = False
 

@@ -14,7 +14,7 @@ from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
 from services.planning.floor_map import CELL_M
-from services.planning.head import Glance, Sweep, glances
+from services.planning.head import Aim, Sweep
 from services.planning.navigation import GENTLE
 from services.planning.seen_floor import Rest, Viewpoint, describe
 
@@ -35,7 +35,7 @@ class Idling:
         if not self._halted and hand is not None:
             self._halted = True
             snapshot.actuators.grip.halt(hand)
-            plan.head = (*snapshot.head_rad, self.HEAD_RADPS)
+            plan.head = Aim(*snapshot.looks_rad, self.HEAD_RADPS)
         return plan
 
 
@@ -52,7 +52,7 @@ class Parking:
         if arm.blocked:
             return Plan(snapshot.stand(), arm, "the way to the park pose is blocked", None, "failed", "blocked")
         done = arm.arrived and snapshot.actuators.arm.parked(snapshot.angles)
-        plan = Plan(snapshot.stand(), arm, "folding the arm up", (0.0, 0.0, 1.5), distance_m=arm.left)
+        plan = Plan(snapshot.stand(), arm, "folding the arm up", Aim(0.0, 0.0, 1.5), distance_m=arm.left)
         if done:
             plan.state, plan.why = "done", "parked"
         return plan
@@ -83,7 +83,7 @@ class Searching:
         self._label = action.label
         self._start: Pose2 | None = None
         self._sweep: Sweep | None = None
-        self._glances: list[Glance] | None = None
+        self._glances: list[Aim] | None = None
         self._rests_since_ns: int | None = None
         self._pictures = self._scans = 0
         self._newest_ns: int | None = None
@@ -103,19 +103,14 @@ class Searching:
             lag_s = snapshot.estimator.sight_lag_s
             sure = snapshot.confirmed(self._label) or (snapshot.estimator.slow_sight and snapshot.clear(target))
             if sure and target.age_s < self.IN_VIEW_S + lag_s:
-                return Plan(
-                    snapshot.stand(),
-                    snapshot.still(),
-                    f"{self._label} is in view",
-                    head,
-                    "done",
-                    distance_m=planar_m(target),
-                )
+                plan = snapshot.looking(f"{self._label} is in view", head, planar_m(target))
+                plan.state = "done"
+                return plan
             if self._looked_at_ns is None or sightings > self._looked_from:
                 self._looked_at_ns, self._looked_from = snapshot.now_ns, sightings
             if snapshot.now_ns - self._looked_at_ns < (config.look_where_it_was_s + 2 * lag_s) * 1e9:
                 why = f"{self._label} was seen {target.age_s:.1f} s ago: looking there"
-                return Plan(snapshot.stand(), snapshot.still(), why, head, distance_m=planar_m(target))
+                return snapshot.looking(why, head, planar_m(target))
         too_near = self._back_away(snapshot)
         if too_near is not None:
             return too_near
@@ -123,11 +118,10 @@ class Searching:
 
     def _look(self, snapshot: Snapshot) -> Plan:
         config, seen = snapshot.actuators.config, snapshot.estimator.seen
-        pan, tilt = snapshot.head_rad
-        lag_s = snapshot.estimator.sight_lag_s
+        gaze, lag_s = snapshot.actuators.gaze, snapshot.estimator.sight_lag_s
         if not seen.running:  # the first look, or the base restarted with a new odometry frame
             seen.begin(snapshot.body)
-            self._sweep, self._glances, self._checked_ns = Sweep(config.head, pan), None, None
+            self._sweep, self._glances, self._checked_ns = gaze.sweep(snapshot), None, None
         seen.stand_at(snapshot.body)
         if self._checked_ns is None or snapshot.now_ns - self._checked_ns >= self.CHECK_NS:
             first = self._checked_ns is None
@@ -135,7 +129,7 @@ class Searching:
             cells = seen.shown(snapshot.body, *snapshot.stands_around)
             self._left_m2 = float(cells.sum()) * CELL_M**2
             if first and self._sweep is None:
-                self._glances = glances(config.head, pan, seen.bearings(cells, snapshot.body))
+                self._glances = gaze.glances(seen.bearings(cells, snapshot.body), snapshot)
         if self._left_m2 < seen.least_m2 and seen.scans:  # without a scan the floor map may be empty
             self._sweep, self._glances = None, []
         # Even slow perception must see every direction twice while the view passes over it.
@@ -145,29 +139,29 @@ class Searching:
                 self._sweep.go_on()
             if not self._sweep.done:
                 why = f"sweeping for {self._label}: {self._sweep.share:.0%} done"
-                return Plan(snapshot.stand(), snapshot.still(), why, (*self._sweep.aim, config.head.fixate_speed_radps))
+                return snapshot.looking(why, Aim(*self._sweep.aim, config.head.fixate_speed_radps))
             self._sweep, self._glances = None, []
         while self._glances:
             glance = self._glances[0]
-            if abs(glance.pan_rad - pan) > 0.05 or abs(glance.tilt_rad - tilt) > 0.05:
+            if not gaze.reached(glance[:2], snapshot):
                 fast = glance.speed_radps > config.head.sweep_speed_radps
-                head = (glance.pan_rad, glance.tilt_rad, glance.speed_radps if fast else min(glance.speed_radps, slow))
+                speed = glance.speed_radps if fast else min(glance.speed_radps, slow)
                 self._rests_since_ns = None
-                return Plan(snapshot.stand(), snapshot.still(), self._why(), head)
+                return snapshot.looking(self._why(), glance._replace(speed_radps=speed))
             if not self._rested(snapshot, lag_s):
-                return Plan(snapshot.stand(), snapshot.still(), self._why())
+                return snapshot.looking(self._why(), None)
             self._glances.pop(0)
             self._rests_since_ns = None
         if self._left_m2 >= seen.least_m2 and not self._rested(snapshot, 2 * lag_s):
-            return Plan(snapshot.stand(), snapshot.still(), self._why())
+            return snapshot.looking(self._why(), None)
         seen.looked_from(snapshot.body, *snapshot.stands_around)
         why = f"{self._label} is not to be seen from here"
         return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
 
     def _pictured(self, snapshot: Snapshot, aim: tuple[float, float]) -> bool:
-        """Whether enough pictures were taken since the head rests at an aim (pan, tilt), rad."""
-        estimator, (pan, tilt) = snapshot.estimator, snapshot.head_rad
-        if abs(aim[0] - pan) > 0.05 or abs(aim[1] - tilt) > 0.05:
+        """Whether enough pictures were taken since the camera rests at an aim (pan, tilt), rad."""
+        estimator = snapshot.estimator
+        if not snapshot.actuators.gaze.reached(aim, snapshot):
             self._rests_since_ns = None
             return False
         if self._rests_since_ns is None:
@@ -210,7 +204,7 @@ class Searching:
         gone = self._start.inverse().compose(snapshot.body)
         if gone.x_m < -self.BACK_M:
             return None
-        pan, _ = snapshot.head_rad
+        pan, _ = snapshot.actuators.gaze.on_body(snapshot.angles)
         speed = -0.10 if abs(pan) < 0.5 else 0.0
         base = snapshot.actuators.driver.command(speed, 1.2 * pan, snapshot.dt_s)
         why = f"{self._label} is too near to be seen in depth: backing away"
@@ -297,13 +291,12 @@ class Exploring:
             return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
         return Plan(snapshot.stand(), snapshot.still(), "the search begins anew", state="done")
 
-    def _turn(self, snapshot: Snapshot, bearing_rad: float, head: tuple[float, float, float]) -> Plan:
+    def _turn(self, snapshot: Snapshot, bearing_rad: float, head: Aim) -> Plan:
         arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
         turn = 1.8 * bearing_rad if snapshot.actuators.arm.parked(snapshot.angles) else 0.0
         base = self._drive(snapshot, 0.0, turn)
-        plan = Plan(
-            base, arm, f"turning to look where the camera's mount hides the floor: {bearing_rad:+.2f} rad", head
-        )
+        hider = snapshot.actuators.gaze.hidden_by
+        plan = Plan(base, arm, f"turning to look where {hider} hides the floor: {bearing_rad:+.2f} rad", head)
         if abs(bearing_rad) < self.AHEAD_RAD:
             plan.state = "done"
         return plan

@@ -1,0 +1,49 @@
+"""Contradictions within a robot description, besides names that it does not have. Each check raises ValueError."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from cocoro.units import Vec3
+
+
+def check_camera(camera: str, links: Mapping[str, tuple[str, str | None]], head: set[str]) -> None:
+    """Refuses a camera that other joints turn than the head's, or that one of these does not turn. `links`: parent and
+    joint of each by its name."""
+    turning, name = set(), camera
+    while name in links:
+        name, joint = links[name]
+        if joint is not None:
+            turning.add(joint)
+    if others := sorted(turning - head):
+        what = "which is none of the head's" if head else "but there is no [head]"
+        raise ValueError(f"kinect.link: the joint {others[0]!r} turns the camera, {what}")
+    if idle := sorted(head - turning):
+        raise ValueError(f"head: the joint {idle[0]!r} does not turn the camera")
+
+
+def check_box(where: str, low_m: Vec3 | None, high_m: Vec3 | None) -> None:
+    """Refuses a box with one corner, or whose corners are swapped. `where`: the field of the first one."""
+    if low_m is None or high_m is None:
+        if low_m != high_m:
+            raise ValueError(f"{where}: a box has two corners, and one of them is missing")
+    elif not all(low < high for low, high in zip(low_m, high_m, strict=True)):
+        raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+
+
+def check_claw(jaws: int, fixed_pad_m: float | None) -> None:
+    """Refuses a claw of another number of jaws than one or two, and a fixed pad where both fingers move or none where
+    one of them is fixed."""
+    if not 1 <= jaws <= 2:
+        raise ValueError(f"claw.open_sign: a claw has one joint or two, not {jaws}")
+    if jaws == 1 and fixed_pad_m is None:
+        raise ValueError("claw: with one joint the other finger is fixed, and fixed_pad_m says where: it is missing")
+    if jaws == 2 and fixed_pad_m is not None:
+        raise ValueError("claw.fixed_pad_m: with two joints no finger is fixed")
+
+
+def check_poses(poses: Mapping[str, Mapping[str, float]], arm: tuple[str, ...]) -> None:
+    """Refuses poses without a joint of the arm that they need."""
+    for name, wanted in (("park", arm), ("upright", arm), ("unfolded", arm[1:])):
+        if missing := [joint for joint in wanted if joint not in poses.get(name, {})]:
+            raise ValueError(f"pose {name}: the angle of {missing[0]!r} is missing")
