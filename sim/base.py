@@ -66,6 +66,7 @@ class MobileBase:
         self._exact = exact or base.kind != "differential"
         self._counters = CreateCounters(self._drive)
         self._rest = self._wanted = self.ramp.wheels_mps
+        self._asked = Twist()
         self._valid_until_ns = -1
         self._next_report_ns = 0
         self.stopped_by = ""
@@ -78,6 +79,7 @@ class MobileBase:
             return STOPPED_BY[self.latch]
         try:
             self._wanted = self._drive.wheels_of(command)
+            self._asked = Twist(command.ahead_mps, command.turn_radps, command.aside_mps)
         except ValueError as error:
             return str(error)
         sent_ns = min(command.stamp_ns or now_ns, now_ns)
@@ -133,14 +135,14 @@ class MobileBase:
         if now_ns > self._valid_until_ns:
             self.stopped_by = "no command"
             return self._rest
-        if not self.bumper.pressed:
-            return self._wanted
         # A round base may still turn on the spot, and leave what it touches.
-        ahead, _, aside = self._drive.twist(self._wanted)
-        into = Twist(max(ahead, 0.0), 0.0, aside if self._touches(aside) else 0.0)
-        if into == Twist():
+        in_front = self.bumper.pressed and self._asked.ahead > 0.0
+        beside = self._touches(self._asked.aside)
+        if not (in_front or beside):
             return self._wanted
         self.stopped_by = "bump"
+        ahead, _, aside = self._drive.twist(self._wanted)
+        into = Twist(ahead if in_front else 0.0, 0.0, aside if beside else 0.0)
         return tuple(wanted - part for wanted, part in zip(self._wanted, self._drive.wheels(into), strict=True))
 
     def _touches(self, aside: float) -> bool:

@@ -192,6 +192,9 @@ def test_three_wheels_stand_in_time_after_the_last_word(twist: Twist, late_s: fl
         (Bumper(left=True), Twist(0.2, 0.3, 0.1), Twist(turn=0.3)),
         (Bumper(left=True), Twist(0.2, 0.0, -0.1), Twist(aside=-0.1)),
         (Bumper(right=True), Twist(-0.1, 0.0, -0.1), Twist(ahead=-0.1)),
+        (Bumper(right=True), Twist(aside=0.13), Twist(aside=0.13)),
+        (Bumper(left=True), Twist(aside=-0.07), Twist(aside=-0.07)),
+        (Bumper(left=True, right=True), Twist(turn=0.7), Twist(turn=0.7)),
         (Bumper(right=True), Twist(-0.1, 0.2, 0.1), Twist(-0.1, 0.2, 0.1)),
     ],
 )
