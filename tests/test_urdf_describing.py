@@ -15,6 +15,7 @@ from urdf_rig import DESK_ARM, LIMIT, MASS, desk_arm, poses
 from apps.urdf.describing import Made, describe
 from apps.urdf.missing import FILE, GUESSED, NEVER
 from apps.urdf.writing import description_text, page_text
+from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
 from cocoro.kinematics import Tree
 from cocoro.robot import Robot
@@ -59,19 +60,45 @@ def test_what_the_joints_are_for_follows_from_order_and_names(made: Made) -> Non
         "grasp_point",
     )
     assert made.robot.claw.open_sign == {"left": -1.0, "right": 1.0}
-    assert made.robot.chain(made.robot.kinect.link).joints == ("swivel", "lift", "bend", "tilt")
     guessed = {row.where for row in made.missing if row.section == GUESSED}
     assert {"`[arm]`", "`[arm] tip`", "`[claw] open_sign`", "`[kinect] link`"} <= guessed
 
 
-def test_the_camera_looks_along_x_of_its_link_unless_that_is_an_optical_frame(tmp_path: Path, made: Made) -> None:
-    zero = dict.fromkeys(made.robot.joints, 0.0)
-    link = Tree(made.robot.links, ["wrist_camera"]).poses(zero)["wrist_camera"]
-    pose = made.robot.camera_chain.pose(zero)
-    assert pose[:3, 2] == pytest.approx(link[:3, 0], abs=1e-9)
-    assert pose[:3, 1] == pytest.approx(-link[:3, 2], abs=1e-9)
-    other = describe(desk_arm(tmp_path, DESK_ARM.replace("wrist_camera", "camera_optical")), "desk").robot
-    assert other.kinect.link == "camera_optical"
+def looks(robot: Robot, **angles_rad: float) -> FloatArray:
+    return robot.camera_chain.pose(dict.fromkeys(robot.joints, 0.0) | angles_rad)
+
+
+def test_a_camera_on_the_arm_is_not_the_robots(made: Made) -> None:
+    robot = made.robot
+    assert robot.camera_chain.joints == (robot.head.pan, robot.head.tilt)
+    assert looks(robot)[:3, 2] == pytest.approx([1, 0, 0], abs=1e-9)
+    assert looks(robot)[:3, 1] == pytest.approx([0, 0, -1], abs=1e-9)
+    assert any("wrist_camera is not used: swivel, lift, bend, tilt turn it" in row.what for row in made.missing)
+
+
+@pytest.mark.parametrize(("name", "lens"), [("front_camera", 0), ("camera_optical", 2)])
+def test_a_camera_on_the_body_looks_along_x_of_its_link_or_along_z_of_an_optical_frame(
+    tmp_path: Path, name: str, lens: int
+) -> None:
+    on_arm = '<parent link="wrist"/><child link="wrist_camera"/>'
+    text = DESK_ARM.replace(on_arm, f'<parent link="foot"/><child link="{name}"/>').replace("wrist_camera", name)
+    robot = describe(desk_arm(tmp_path, text), "desk").robot
+    zero = dict.fromkeys(robot.joints, 0.0)
+    link = Tree(robot.links, [name]).poses(zero)[name]
+    assert looks(robot)[:3, 2] == pytest.approx(link[:3, lens], abs=1e-9)
+    assert looks(robot)[:3, 3] == pytest.approx(link[:3, 3], abs=1e-9)
+
+
+def test_two_joints_above_a_camera_are_the_head(tmp_path: Path) -> None:
+    neck = f"""<link name="neck">{MASS}</link><link name="skull">{MASS}</link><link name="camera"/>
+      <joint name="shake" type="revolute"><parent link="foot"/><child link="neck"/><axis xyz="0 0 1"/>{LIMIT}</joint>
+      <joint name="nod" type="revolute"><parent link="neck"/><child link="skull"/><axis xyz="0 -1 0"/>{LIMIT}</joint>
+      <joint name="to_eye" type="fixed"><parent link="skull"/><child link="camera"/></joint></robot>"""
+    made = describe(desk_arm(tmp_path, DESK_ARM.replace("</robot>", neck)), "desk")
+    robot = made.robot
+    assert (robot.head.pan, robot.head.tilt) == ("shake", "nod")
+    assert robot.camera_chain.joints == ("shake", "nod")
+    assert "`[head]`" not in {row.where for row in made.missing}
 
 
 def test_masses_their_centres_and_moments_are_the_urdfs(made: Made) -> None:

@@ -12,7 +12,8 @@ from apps.urdf.hand import PAD_HEIGHT_M, PAD_THICKNESS_M, Hand
 from apps.urdf.model import Urdf
 from apps.urdf.parts import lowest_m
 from apps.urdf.roles import Roles
-from apps.urdf.rows import BODY, Rows, rounded
+from apps.urdf.rows import BODY, Rows, inverse_of, rounded
+from cocoro.arrays import FloatArray
 from cocoro.kinematics import Origin
 from cocoro.robot import Robot
 from sim.body import CASTER_RADIUS_M
@@ -25,6 +26,8 @@ MAX_WHEEL_SPEED_MPS = 0.3
 CAMERA_M = (-0.12, 0.0, 0.45)
 """Where the camera stands, above the chassis, when the URDF has none."""
 _HEAD = "head_pan", "head_tilt"
+_TILT = Origin((0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.0))
+"""In the pan's frame, whose axes are the body's: positive angles look up."""
 _MOUNT_M = 0.02
 _HOUSING_M = 0.08
 _TO_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -77,16 +80,20 @@ def body_of(urdf: Urdf, roles: Roles) -> Body:
 
 
 def head_of(
-    roles: Roles, rows: Rows, body: Body, joints: list[dict[str, Any]]
+    urdf: Urdf, roles: Roles, rows: Rows, body: Body, joints: list[dict[str, Any]]
 ) -> tuple[tuple[str, str], list[dict[str, Any]]]:
     """The joints of the head and the parts of its links: those above the URDF's camera, if they are two, else two that
-    are added, with their rows."""
+    are added where the camera is, with their rows."""
     if len(roles.head) == 2:
         return (roles.head[0], roles.head[1]), []
     pan, tilt = (rows.free(name, "joint") for name in _HEAD)
-    x, y, z = CAMERA_M
-    rows.add(pan, BODY, Origin((x, y, z + body.top_m), (0.0, 0.0, 0.0)), pan)
-    rows.add(tilt, pan, Origin((0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.0)), tilt)
+    upright = np.eye(4)
+    upright[:3, 3] = body.camera_m
+    if roles.camera is None:
+        rows.add(pan, BODY, Origin.of(upright), pan)
+    else:
+        rows.add(pan, rows.link[roles.camera], Origin.of(inverse_of(_camera_pose(urdf, roles, body)) @ upright), pan)
+    rows.add(tilt, pan, _TILT, tilt)
     for name in (pan, tilt):
         joints.append({"name": name, "network": "arm", "id": len(joints) + 1, "limits_deg": [-90.0, 90.0],
                        "torque_nm": TORQUE_NM, "max_speed_radps": SPEED_RADPS})  # fmt: skip
@@ -97,25 +104,32 @@ def head_of(
     return (pan, tilt), parts
 
 
-def camera_of(roles: Roles, rows: Rows, body: Body, head: tuple[str, str]) -> dict[str, Any]:
-    """The camera's table, and the row of its frame."""
+def camera_of(urdf: Urdf, roles: Roles, rows: Rows, body: Body, head: tuple[str, str]) -> dict[str, Any]:
+    """The camera's table, and the row of its frame, which is that of the URDF's link at angle 0, its lens along x or,
+    of an optical frame, along z."""
     turn = np.eye(4)
-    turn[:3, :3] = _TO_OPTICAL
-    if roles.camera is None:
-        upright = Origin(
-            (0.0, 0.0, 0.0), (-np.pi / 2, 0.0, 0.0)
-        ).transform()  # from the tilt's frame to the body's axes
-        link = rows.add(rows.free("camera", "link"), head[1], Origin.of(upright @ turn))
-    elif "optical" in roles.camera.lower():
-        link = rows.link[roles.camera]
+    if roles.camera is None or "optical" not in roles.camera.lower():
+        turn[:3, :3] = _TO_OPTICAL
+    if len(roles.head) == 2 and roles.camera is not None:
+        parent = rows.link[roles.camera]
     else:
-        link = rows.add(rows.free(f"{roles.camera}_optical", "link"), rows.link[roles.camera], Origin.of(turn))
+        parent = head[1]
+        if roles.camera is not None:
+            turn[:3, :3] = _camera_pose(urdf, roles, body)[:3, :3] @ turn[:3, :3]
+        turn = inverse_of(_TILT.transform()) @ turn
+    link = rows.add(rows.free("camera", "view"), parent, Origin.of(turn))
     x, y = CAMERA_M[0] - 2 * _MOUNT_M, CAMERA_M[1]
     low = [x - _MOUNT_M, y - _MOUNT_M, body.top_m]
     high = [x, y + _MOUNT_M, body.top_m + (CAMERA_M[2] if roles.camera is None else _MOUNT_M)]
     table = Robot.load().to_data()["kinect"] | {"link": link, "colour_lens": None, "depth_lens": None}
     table["mount_min_m"], table["mount_max_m"] = ([rounded(value, 4) for value in corner] for corner in (low, high))
     return {name: value for name, value in table.items() if value is not None}
+
+
+def _camera_pose(urdf: Urdf, roles: Roles, body: Body) -> FloatArray:
+    """The frame (4, 4) of the URDF's camera in the body's, m, with all joints at 0."""
+    assert roles.camera is not None
+    return np.asarray(body.root.transform() @ urdf.poses()[roles.camera])
 
 
 def claw_of(urdf: Urdf, roles: Roles, hand: Hand) -> dict[str, Any]:

@@ -59,9 +59,9 @@ def _described(urdf: Urdf, name: str) -> Made:
         rows.free("tip", "link"), rows.link[urdf.joints[roles.roll].child], Origin.of(hand.place)
     )  # fmt: skip
     joints = [_joint(urdf, joint, roles) for joint in roles.joints]
-    head, head_parts = head_of(roles, rows, body, joints)
+    head, head_parts = head_of(urdf, roles, rows, body, joints)
     data: dict[str, Any] = {"name": name, "base": body.base(parts.mass_kg)}
-    data["kinect"] = camera_of(roles, rows, body, head)
+    data["kinect"] = camera_of(urdf, roles, rows, body, head)
     data["head"] = {"pan": head[0], "tilt": head[1]}
     data["arm"] = {"joints": list(roles.arm), "bend": roles.bend, "roll": roles.roll, "tip": tip}
     data["link"] = rows.data

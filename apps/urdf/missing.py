@@ -113,7 +113,7 @@ def _guessed(roles: Roles, hand: Hand, data: dict[str, Any]) -> list[Missing]:
         rows.append(
             Missing(GUESSED, "the way in which the jaws open", "`[claw] open_sign`", signs, "it closes to open")
         )
-    camera = roles.camera or f"{data['kinect']['link']}, added on a mast: the URDF has no link of that name"
+    camera = roles.camera or f"{data['kinect']['link']}, added on a mast"
     rows.append(
         Missing(GUESSED, "the camera's place", "`[kinect] link`", camera, "what it sees is taken to be elsewhere")
     )

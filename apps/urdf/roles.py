@@ -19,6 +19,7 @@ _TIP = re.compile(r"tip|tcp|tool|frame|grasp|(^|_)ee(_|$)|end_?effector", re.IGN
 _HOLDER = re.compile(r"mount|bracket|holder|mast|base", re.IGNORECASE)
 _CAMERA = re.compile(r"cam|kinect|optical", re.IGNORECASE)
 _LEAST_ARM = 3
+_MOST_JAWS = 2
 _PARALLEL = 0.95
 """Least cosine of the angle between two axes that count as parallel."""
 
@@ -54,7 +55,7 @@ def roles_of(urdf: Urdf) -> Roles:
     chains = [[joint.name for joint in urdf.moving(urdf.joints[name].child)] for name in joints if not below[name]]
     chains.sort(key=lambda chain: (not any(_is_jaw(urdf.joints[name]) for name in chain), -len(chain)))
     chain = chains[0] if chains else []
-    doubts = []
+    doubts: list[str] = []
     if len(chain) > _LEAST_ARM and _is_jaw(urdf.joints[chain[-1]]):
         chain = chain[:-1]
         while len(chain) > _LEAST_ARM and _JAW_JOINT.search(chain[-1]):
@@ -69,37 +70,38 @@ def roles_of(urdf: Urdf) -> Roles:
             f" the hand), and the longest chain {have}"
         )
     arm, roll = tuple(chain[:-1]), chain[-1]
-    jaws = tuple(below[roll])
+    jaws = tuple(sorted(below[roll], key=lambda name: not _is_jaw(urdf.joints[name]))[:_MOST_JAWS])
     if not jaws:
-        doubts.append(f"gripper: no joint moves behind {roll}, so the hand cannot close")
+        doubts.append(f"[claw] open_sign: no joint moves behind {roll}, so the hand cannot close")
     axes = {name: _axis(urdf, name) for name in chain}
     bends = [two for one, two in pairwise(arm) if abs(float(axes[one] @ axes[two])) > _PARALLEL]
     bend = bends[0] if bends else arm[len(arm) // 2]
     if not bends:
-        doubts.append(f"arm.bend: no joint of the arm is parallel to the one before it; {bend} is in the middle")
+        doubts.append(f"[arm] bend: no joint of the arm is parallel to the one before it; {bend} is in the middle")
     if axes[arm[0]][2] < _PARALLEL:
         doubts.append(
-            f"arm.joints: the first one is to turn the arm about the vertical, counter-clockwise positive as seen from"
-            f" above; the axis of {arm[0]} points to {np.round(axes[arm[0]], 2).tolist()} in the body's frame"
+            f"[arm] joints: the first one is to turn the arm about the vertical, counter-clockwise positive as seen"
+            f" from above; the axis of {arm[0]} points to {np.round(axes[arm[0]], 2).tolist()} in the body's frame"
         )
     tips = [link for link in _rigid_with(urdf, urdf.joints[roll].child) if _TIP.search(link)]
-    camera, head = _camera(urdf, set(wheels), set(chain) | set(jaws))
+    camera, head = _camera(urdf, set(wheels), set(chain) | set(jaws), doubts)
     return Roles(joints, wheels, arm, bend, roll, jaws, tips[-1] if tips else None, camera, head, tuple(doubts))
 
 
-def _camera(urdf: Urdf, wheels: set[str], limb: set[str]) -> tuple[str | None, tuple[str, ...]]:
-    """The link of the camera, one that is not on the arm first, and the joints above it."""
-    found = [link for link in urdf.links if _CAMERA.search(link)]
-    if not found:
-        return None, ()
-
-    def above(link: str) -> list[str]:
-        return [joint.name for joint in urdf.moving(link) if joint.name not in wheels]
-
-    free = [link for link in found if not limb & set(above(link))] or found
-    free.sort(key=lambda link: ("optical" not in link.lower(), bool(_HOLDER.search(link))))
-    link = free[0]
-    return link, tuple(name for name in above(link) if name not in limb)
+def _camera(urdf: Urdf, wheels: set[str], limb: set[str], doubts: list[str]) -> tuple[str | None, tuple[str, ...]]:
+    """The link of the camera and the joints above it: one that stands on the body, or that two joints turn as a head's
+    do. Those on other joints become doubts."""
+    fit = []
+    for link in (link for link in urdf.links if _CAMERA.search(link)):
+        above = tuple(joint.name for joint in urdf.moving(link) if joint.name not in wheels)
+        if len(above) in (0, 2) and not limb & set(above):
+            fit.append((link, above))
+        else:
+            doubts.append(
+                f"[kinect] link: the camera {link} is not used: {', '.join(above)} turn it, which are no head"
+            )
+    fit.sort(key=lambda one: ("optical" not in one[0].lower(), bool(_HOLDER.search(one[0]))))
+    return fit[0] if fit else (None, ())
 
 
 def _is_jaw(joint: UrdfJoint) -> bool:
