@@ -130,7 +130,8 @@ def _guessed(roles: Roles, hand: Hand, data: dict[str, Any]) -> list[Missing]:
         rows.append(Missing(GUESSED, "what these joints are for", "`[arm]`", ", ".join(idle), "they hold still"))
     for doubt in roles.doubts:
         where, _, sentence = doubt.partition(": ")
-        rows.append(Missing(GUESSED, sentence, f"`{where}`", "as it is", "reaching goes wrong"))
+        so = "its pictures are not used" if where.startswith("[kinect]") else "reaching goes wrong"
+        rows.append(Missing(GUESSED, sentence, f"`{where}`", "as it is", so))
     return rows
 
 
