@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.base import Base
-from cocoro.description_checks import check_box, check_camera, check_claw, check_poses
+from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses
 from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker
 from cocoro.errors import ConfigError
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
@@ -100,11 +100,14 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def __post_init__(self) -> None:
         """Refuses what contradicts itself: names of links and joints that the description does not have, circles of
         links, lines with one ID twice, limbs whose joints move nothing or are on several lines, a camera that other
-        joints turn than the head's, poses without a joint that they need, boxes with one corner or swapped ones."""
+        joints turn than the head's, poses without a joint that they need, boxes with one corner or swapped ones, links
+        that turn and have no mass."""
         self._check_links()
         self._check_places()
         self._check_limbs()
-        check_camera(self.kinect.link, {row.name: (row.parent, row.joint) for row in self.link}, self._head_joints)
+        links = {row.name: (row.parent, row.joint) for row in self.link}
+        check_camera(self.kinect.link, links, self._head_joints)
+        check_masses(links, [part.link for part in self.solid.part if part.mass_kg > 0.0], self.claw.open_sign)
         check_claw(len(self.claw.open_sign), self.claw.fixed_pad_m)
         check_box("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m)
         check_box("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m)

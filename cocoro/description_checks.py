@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from cocoro.units import Vec3
 
@@ -20,6 +20,20 @@ def check_camera(camera: str, links: Mapping[str, tuple[str, str | None]], head:
         raise ValueError(f"kinect.link: the joint {others[0]!r} turns the camera, {what}")
     if idle := sorted(head - turning):
         raise ValueError(f"head: the joint {idle[0]!r} does not turn the camera")
+
+
+def check_masses(links: Mapping[str, tuple[str, str | None]], massive: Iterable[str], jaws: Iterable[str]) -> None:
+    """Refuses a link that a joint turns and that carries no mass: nothing can be computed of how it moves. `links`:
+    parent and joint of each by its name; `massive`: those with parts that have a mass; `jaws`: the joints of the claw,
+    whose pads have theirs."""
+    carrying = set()
+    for link in massive:
+        while link in links and links[link][1] is None:
+            link = links[link][0]
+        carrying.add(link)
+    for name, (_, joint) in links.items():
+        if joint is not None and joint not in jaws and name not in carrying:
+            raise ValueError(f"solid.part: the joint {joint!r} turns the link {name!r}, and no part there has a mass")
 
 
 def check_box(where: str, low_m: Vec3 | None, high_m: Vec3 | None) -> None:

@@ -119,9 +119,11 @@ def _link_xml(name: str, placed: list[tuple[FloatArray, Part]]) -> str:
 
 
 def _inertial_xml(placed: list[tuple[FloatArray, Part]]) -> list[str]:
+    """Without a mass, which only what is fixed on the body may be, the centre is that of the frame."""
     mass = sum(part.mass_kg for _, part in placed)
     centres = [(offset @ pose_of(part))[:3, 3] for offset, part in placed]
-    centre = sum((part.mass_kg * c for c, (_, part) in zip(centres, placed, strict=True)), np.zeros(3)) / mass
+    centre = sum((part.mass_kg * c for c, (_, part) in zip(centres, placed, strict=True)), np.zeros(3))
+    centre = centre / mass if mass else centre
     inertia = np.zeros((3, 3))
     for at, (offset, part) in zip(centres, placed, strict=True):
         turn, arm = offset[:3, :3], at - centre

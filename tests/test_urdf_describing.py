@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from urdf_rig import DESK_ARM, LIMIT, MASS, desk_arm, poses
 
+from apps.urdf.assumed import CAMERA_DOWN_DEG
 from apps.urdf.describing import Made, describe
 from apps.urdf.missing import FILE, GUESSED, NEVER
 from apps.urdf.writing import description_text, page_text
@@ -61,7 +62,15 @@ def test_what_the_joints_are_for_follows_from_order_and_names(made: Made) -> Non
     )
     assert made.robot.claw.open_sign == {"left": -1.0, "right": 1.0}
     guessed = {row.where for row in made.missing if row.section == GUESSED}
-    assert {"`[arm]`", "`[arm] tip`", "`[claw] open_sign`", "`[kinect] link`"} <= guessed
+    assert {"`[arm]`", "`[arm] tip`", "`[claw] open_sign`"} <= guessed
+    assert any(row.what == "the camera's place" and "fixed on the body" in row.now for row in made.missing)
+
+
+def test_nothing_is_added_that_the_urdf_does_not_have(made: Made) -> None:
+    robot = made.robot
+    assert (robot.head, robot.marker, robot.kinect.mount, robot.hull.kinect) == (None, None, None, None)
+    assert set(robot.joints) == set(JOINTS)
+    assert {joint.network for joint in robot.joints.values()} == {"bus"}
 
 
 def looks(robot: Robot, **angles_rad: float) -> FloatArray:
@@ -70,9 +79,10 @@ def looks(robot: Robot, **angles_rad: float) -> FloatArray:
 
 def test_a_camera_on_the_arm_is_not_the_robots(made: Made) -> None:
     robot = made.robot
-    assert robot.camera_chain.joints == (robot.head.pan, robot.head.tilt)
-    assert looks(robot)[:3, 2] == pytest.approx([1, 0, 0], abs=1e-9)
-    assert looks(robot)[:3, 1] == pytest.approx([0, 0, -1], abs=1e-9)
+    assert robot.camera_chain.joints == ()
+    down = np.radians(CAMERA_DOWN_DEG)
+    assert looks(robot)[:3, 2] == pytest.approx([np.cos(down), 0, -np.sin(down)], abs=1e-9)
+    assert looks(robot)[:3, 0] == pytest.approx([0, -1, 0], abs=1e-9)
     assert any("wrist_camera is not used: swivel, lift, bend, tilt turn it" in row.what for row in made.missing)
 
 
@@ -96,6 +106,7 @@ def test_two_joints_above_a_camera_are_the_head(tmp_path: Path) -> None:
       <joint name="to_eye" type="fixed"><parent link="skull"/><child link="camera"/></joint></robot>"""
     made = describe(desk_arm(tmp_path, DESK_ARM.replace("</robot>", neck)), "desk")
     robot = made.robot
+    assert robot.head is not None
     assert (robot.head.pan, robot.head.tilt) == ("shake", "nod")
     assert robot.camera_chain.joints == ("shake", "nod")
     assert "`[head]`" not in {row.where for row in made.missing}
@@ -188,3 +199,10 @@ def test_a_robot_without_an_arm_is_refused(tmp_path: Path) -> None:
         describe(desk_arm(tmp_path, short), "desk")
     with pytest.raises(ConfigError, match="the longest chain has none"):
         describe(desk_arm(tmp_path, '<robot name="r"><link name="a"/></robot>'), "desk")
+
+
+def test_a_robot_whose_hand_cannot_close_is_refused(tmp_path: Path) -> None:
+    text = DESK_ARM.replace('name="left" type="revolute"', 'name="left" type="fixed"')
+    text = text.replace('name="right" type="revolute"', 'name="right" type="fixed"')
+    with pytest.raises(ConfigError, match=r"desk\.urdf: has no hand that closes: no joint turns behind spin"):
+        describe(desk_arm(tmp_path, text), "desk")

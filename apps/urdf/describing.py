@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from apps.urdf.assumed import LIMITS_DEG, SPEED_RADPS, TORQUE_NM, body_of, camera_of, claw_of, head_of, stand_ins
+from apps.urdf.assumed import LIMITS_DEG, LINE, SPEED_RADPS, TORQUE_NM, body_of, camera_of, claw_of, lines
 from apps.urdf.hand import hand_of
 from apps.urdf.missing import Missing, missing_of
 from apps.urdf.model import Urdf
@@ -54,25 +54,26 @@ def _described(urdf: Urdf, name: str) -> Made:
     hand = hand_of(urdf, roles)
     body = body_of(urdf, roles)
     rows = Rows(urdf, body.root, roles.joints, hand.jaws)
-    parts = Parts(urdf, rows, body.root, roles.wheels)
+    rolling = () if body.rolling is None else body.rolling.joints
+    parts = Parts(urdf, rows, body.root, roles.wheels, rolling)
     tip = rows.link[hand.tip] if hand.tip else rows.add(
         rows.free("tip", "link"), rows.link[urdf.joints[roles.roll].child], Origin.of(hand.place)
     )  # fmt: skip
     joints = [_joint(urdf, joint, roles) for joint in roles.joints]
-    head, head_parts = head_of(urdf, roles, rows, body, joints)
     data: dict[str, Any] = {"name": name, "base": body.base(parts.mass_kg)}
-    data["kinect"] = camera_of(urdf, roles, rows, body, head)
-    data["head"] = {"pan": head[0], "tilt": head[1]}
+    data["kinect"] = camera_of(roles, rows, body)
+    if roles.head:
+        data["head"] = {"pan": roles.head[0], "tilt": roles.head[1]}
     data["arm"] = {"joints": list(roles.arm), "bend": roles.bend, "roll": roles.roll, "tip": tip}
     data["link"] = rows.data
-    data |= stand_ins(roles, rows)
+    data["network"] = lines()
     data["joint"] = joints
-    data["claw"] = claw_of(urdf, roles, hand)
+    data["claw"] = claw_of(hand)
     data["hull"] = {"tube": _tubes(roles, rows, tip, data["link"]), **body.hull(roles, hand)}
     data["pose"] = _poses(roles, joints)
-    data["solid"] = _solid(urdf, roles, rows, parts, head_parts)
+    data["solid"] = _solid(urdf, roles, rows, parts)
     try:
-        robot = Robot.from_data(data, "the description made of it")
+        robot = Robot.from_data({"head": None} | data, "the description made of it")
     except ConfigError as error:
         raise UrdfError(str(error)) from error
     return Made(data, missing_of(urdf, roles, hand, parts, body, data), robot)
@@ -83,7 +84,7 @@ def _joint(urdf: Urdf, name: str, roles: Roles) -> dict[str, Any]:
     low, high = LIMITS_DEG if joint.limits_rad is None else map(degrees, joint.limits_rad)
     return {
         "name": name,
-        "network": "hand" if name in (roles.roll, *roles.jaws) else "arm",
+        "network": LINE,
         "id": roles.joints.index(name) + 1,
         "limits_deg": [rounded(low, 4), rounded(high, 4)],
         "torque_nm": rounded(joint.effort_nm or TORQUE_NM),
@@ -132,10 +133,10 @@ def _poses(roles: Roles, joints: list[dict[str, Any]]) -> dict[str, dict[str, fl
     }
 
 
-def _solid(urdf: Urdf, roles: Roles, rows: Rows, parts: Parts, more: list[dict[str, Any]]) -> dict[str, Any]:
+def _solid(urdf: Urdf, roles: Roles, rows: Rows, parts: Parts) -> dict[str, Any]:
     carrier = carriers(urdf, rows)
     above = {rows.joint[name]: carrier[urdf.joints[name].parent] for name in roles.joints}
     touching = parts.touching(above)
     wrist = above[rows.joint[roles.roll]]
     touching += [pair for jaw in roles.jaws if (pair := (wrist, rows.joint[jaw])) not in touching and wrist in above]
-    return {"mount_mass_kg": 0.2, "touching": [list(pair) for pair in touching], "part": [*parts.data, *more]}
+    return {"mount_mass_kg": 0.0, "touching": [list(pair) for pair in touching], "part": parts.data}

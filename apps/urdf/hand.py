@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from apps.urdf.model import Urdf
-from apps.urdf.roles import Roles
+from apps.urdf.model import Urdf, UrdfJoint
+from apps.urdf.parts import half_m
+from apps.urdf.roles import Roles, rigid_with
 from apps.urdf.rows import turn_to
 from cocoro.arrays import FloatArray
 
@@ -16,6 +18,8 @@ _AHEAD_M = 0.05
 _LEAST_REACH_M = 0.01
 _ALONG = 0.8
 """Least cosine between the z axis of a link and the hand of which it is the tip."""
+_ALONG_ONE = 0.995
+"""The same for a hand with one jaw, whose fixed pad lies along the roll axis."""
 PAD_THICKNESS_M, PAD_HEIGHT_M = 0.008, 0.02
 _LEAST_GAP_M, _LEAST_PAD_M, _GREATEST_PAD_M = 0.04, 0.02, 0.11
 
@@ -33,6 +37,12 @@ class Hand:
     axis, y lies along the hand, and the tip is at z = 0."""
     pad_length_m: float
     pad_gap_m: float
+    open_sign: dict[str, float]
+    """Jaws open towards the farther end of their limits."""
+    fixed_pad_m: float | None
+    """With one jaw: distance of the other finger's face from the tip's axis."""
+    pads_known: bool
+    """Whether that distance and the gap are those of solids."""
     finger_deg: dict[str, float]
     """By jaw, the angle in its x-y plane from x to its finger."""
 
@@ -48,7 +58,8 @@ def hand_of(urdf: Urdf, roles: Roles) -> Hand:
     ahead = [*pivots, *([] if known is None else [known[:3, 3]])] or _middles(urdf, roll.child)
     along = -axis if sum(float(axis @ point) for point in ahead) < 0.0 else axis
     farthest = max((float(along @ pivot) for pivot in pivots), default=0.0)
-    if known is not None and float(known[:3, 2] @ along) > _ALONG and _is_ahead(known[:3, 3], pivots, along):
+    least = _ALONG if len(roles.jaws) > 1 else _ALONG_ONE
+    if known is not None and float(known[:3, 2] @ along) > least and _is_ahead(known[:3, 3], pivots, along):
         return _with_jaws(urdf, roles, roles.tip, known)
     place = turn_to(along)
     if known is not None and _is_ahead(known[:3, 3], pivots, along):
@@ -67,6 +78,8 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
     palm = poses[urdf.joints[roles.roll].child]
     point, along = (palm @ place)[:3, 3], (palm @ place)[:3, 2]
     frames, finger_deg, reaches, offsets = {}, {}, [], []
+    signs = {jaw: _opens(urdf.joints[jaw]) for jaw in roles.jaws}
+    only = roles.jaws[0] if len(roles.jaws) == 1 else None
     for jaw in roles.jaws:
         joint = urdf.joints[jaw]
         child = poses[joint.child]
@@ -76,6 +89,8 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
         y = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else turn_to(z)[:3, 1]
         offset = float((pivot - palm[:3, 3]) @ np.cross(y, z))
         side = -1.0 if offset < 0.0 else 1.0
+        if jaw == only:
+            side = -signs[jaw]  # it opens away from the fixed finger, wherever its axis is
         frame = np.eye(4)
         frame[:3, :3] = np.stack((side * np.cross(y, z), side * y, z), axis=1)
         frame[:3, 3] = pivot
@@ -84,7 +99,65 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
         reaches.append(abs(float(y @ (point - pivot))))
         offsets.append(abs(offset))
     pad_m = min(max(min(reaches, default=_GREATEST_PAD_M), _LEAST_PAD_M), _GREATEST_PAD_M)
-    return Hand(tip, place, frames, pad_m, max(_LEAST_GAP_M, 2.0 * max(offsets, default=0.0)), finger_deg)
+    gap_m, fixed_m, known = max(_LEAST_GAP_M, 2.0 * max(offsets, default=0.0)), None, False
+    if only is not None:
+        outward = (poses[urdf.joints[only].child] @ frames[only])[:3, 0]
+        pivot_m = float(((poses[urdf.joints[only].child] @ frames[only])[:3, 3] - point) @ outward)
+        gap_m, fixed_m, known = _pads(urdf, roles, point, along, outward, pivot_m)
+        frames[roles.roll] = np.linalg.inv(palm) @ _hand_frame(palm, urdf.joints[roles.roll], outward)
+    return Hand(tip, place, frames, pad_m, gap_m, signs, fixed_m, known, finger_deg)
+
+
+def _opens(joint: UrdfJoint) -> float:
+    low, high = joint.limits_rad or (-1.0, 1.0)
+    return -1.0 if -low > high else 1.0
+
+
+def _hand_frame(palm: FloatArray, roll: UrdfJoint, outward: FloatArray) -> FloatArray:
+    """The frame (4, 4) in the root's whose z is the roll's axis and whose x is the way that the only jaw opens."""
+    z = palm[:3, :3] @ roll.axis
+    x = outward - z * float(z @ outward)
+    x /= np.linalg.norm(x)
+    frame = np.array(palm)
+    frame[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
+    return frame
+
+
+def _pads(
+    urdf: Urdf, roles: Roles, point: FloatArray, along: FloatArray, outward: FloatArray, pivot_m: float
+) -> tuple[float, float, bool]:
+    """Gap of the pads and the fixed one's distance from the tip's axis, m, with one jaw, and whether both are those of
+    solids that the hand and the jaw have on either side of the tip. `pivot_m`: the jaw's axis from there, outward."""
+    least_m = max(_LEAST_GAP_M / 2, pivot_m)
+    hand = (urdf.joints[roles.roll].child, *rigid_with(urdf, urdf.joints[roles.roll].child))
+    moving = (urdf.joints[roles.jaws[0]].child, *rigid_with(urdf, urdf.joints[roles.jaws[0]].child))
+    across = [_spans(urdf, links, point, along, outward) for links in (hand, moving)]
+    fixed = [-high for low, high in across[0] if high <= 0.0]
+    jaw = [low for low, _ in across[1] if low >= 0.0]
+    if not fixed or not jaw or len(fixed) < len(across[0]) or len(jaw) < len(across[1]):
+        return 2.0 * least_m, least_m, False
+    fixed_m, jaw_m = min(fixed), min(jaw)
+    if fixed_m + jaw_m < _LEAST_PAD_M / 2 or jaw_m < pivot_m - PAD_THICKNESS_M:
+        return 2.0 * least_m, least_m, False
+    return fixed_m + jaw_m, fixed_m, True
+
+
+def _spans(
+    urdf: Urdf, links: Iterable[str], point: FloatArray, along: FloatArray, outward: FloatArray
+) -> list[tuple[float, float]]:
+    """From where to where, outward from the tip's axis, m, those solids of the links go that are beside the tip."""
+    poses, spans = urdf.poses(), []
+    for link in links:
+        for solid in urdf.links[link].solids:
+            place = poses[link] @ solid.place
+            half = half_m(solid)
+            ahead, out = (
+                (float(way @ (place[:3, 3] - point)), float(np.abs(way @ place[:3, :3]) @ half))
+                for way in (along, outward)
+            )
+            if abs(ahead[0]) < ahead[1]:
+                spans.append((out[0] - out[1], out[0] + out[1]))
+    return spans
 
 
 def _middles(urdf: Urdf, link: str) -> list[FloatArray]:

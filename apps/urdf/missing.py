@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from math import degrees
 from typing import Any, NamedTuple
 
-from apps.urdf.assumed import LIMITS_DEG, SPEED_RADPS, TORQUE_NM, Body
+from apps.urdf.assumed import CAMERA_DOWN_DEG, LIMITS_DEG, LINE, LOAD_KG, SPEED_RADPS, TORQUE_NM, Body
 from apps.urdf.hand import Hand
 from apps.urdf.model import Urdf
 from apps.urdf.parts import ASSUMED_MASS_KG, Parts
 from apps.urdf.roles import Roles
+from apps.urdf.wheels import RADIUS_M
 
 NEVER, GUESSED, FILE = "What no URDF says", "Guessed from order and names", "What this file lacks"
 
@@ -29,30 +31,13 @@ class Missing(NamedTuple):
 def missing_of(
     urdf: Urdf, roles: Roles, hand: Hand, parts: Parts, body: Body, data: dict[str, Any]
 ) -> tuple[Missing, ...]:
-    return (
-        *_never(urdf, roles, body, data),
-        *_guessed(roles, hand, data),
-        *_lacking(urdf, roles, parts),
-    )
+    rows = (*_never(roles, body, data), *_guessed(roles, hand, body, data), *_lacking(urdf, roles, parts))
+    return tuple(sorted(rows, key=lambda row: (NEVER, GUESSED, FILE).index(row.section)))
 
 
-def _never(urdf: Urdf, roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
-    base, x_y_z = data["base"], [round(value, 3) for value in body.root.xyz_m]
-    wheels = (
-        f" The URDF has the wheels {', '.join(roles.wheels)}: in the simulator they are rigid." if roles.wheels else ""
-    )
+def _never(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
     return [
-        Missing(
-            NEVER, "kind, wheels and limits of the base", "`[base]`",
-            f"a differential base, {base['chassis_diameter_m']:g} m wide, its wheels {base['wheel_separation_m']:g} m"
-            f" apart, at most {base['max_wheel_speed_mps']:g} m/s.{wheels}",
-            "it drives in the simulator; a real one drives other distances than were asked for",
-        ),
-        Missing(
-            NEVER, "where the URDF's root is in the body's frame (on the floor, x ahead, z up, amid the wheels)",
-            f"`[[link]]` {data['link'][0]['name']}, and the parts of the link `body`", f"{x_y_z} m, not turned",
-            "every place that the arm reaches is shifted or turned",
-        ),
+        *_base(roles, body, data),
         Missing(
             NEVER, "time for which a command counts, time to stand still, acceleration", "`[base]`, `[network.*]`",
             "the Calliope's", "the emergency stop keeps its times only if the base can brake so hard",
@@ -62,7 +47,8 @@ def _never(urdf: Urdf, roles: Roles, body: Body, data: dict[str, Any]) -> list[M
             "servos of another protocol do not answer",
         ),
         Missing(
-            NEVER, "lines and IDs of the servos", "`[[joint]]` network, id", "IDs counted up in the URDF's order",
+            NEVER, "lines and IDs of the servos", "`[[joint]]` network, id",
+            f"all on the line `{LINE}`, IDs counted up in the URDF's order",
             "an order goes to another joint: set them before the servos have power",
         ),
         Missing(
@@ -88,13 +74,68 @@ def _never(urdf: Urdf, roles: Roles, body: Body, data: dict[str, Any]) -> list[M
             "pads that reach from the jaws' axes to the tip", "the simulated hand grips elsewhere than the real one",
         ),
         Missing(
-            NEVER, "the ball on the hand that learning looks at", "`[marker]`", "a ball 40 mm beside the roll's axis",
-            "babbling does not find the hand",
+            NEVER, "the ball on the hand that learning looks at", "`[marker]`", "none",
+            "the arm cannot be learned: `cocoro learn` and `babble-arm` are refused",
+        ),
+        Missing(
+            NEVER, "space of the camera and of what holds it up",
+            "`[kinect] mount_min_m`, `mount_max_m`, `[hull] kinect_min_m`, `kinect_max_m`", "none",
+            "the planner does not keep the arm off them",
         ),
     ]  # fmt: skip
 
 
-def _guessed(roles: Roles, hand: Hand, data: dict[str, Any]) -> list[Missing]:
+def _base(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
+    base, rolling, x_y_z = data["base"], body.rolling, [round(value, 3) for value in body.root.xyz_m]
+    of_root = f"`[[link]]` {data['link'][0]['name']}, and the parts of the link `body`"
+    if rolling is None:
+        wheels = f" The URDF has the wheels {', '.join(roles.wheels)}: in the simulator they are rigid."
+        return [
+            Missing(
+                NEVER, "kind, wheels and limits of the base", "`[base]`",
+                f"a differential base, {base['chassis_diameter_m']:g} m wide, its wheels"
+                f" {base['wheel_separation_m']:g} m apart, at most {base['max_wheel_speed_mps']:g} m/s."
+                + (wheels if roles.wheels else ""),
+                "it drives in the simulator; a real one drives other distances than were asked for",
+            ),
+            Missing(
+                NEVER, "where the URDF's root is in the body's frame (on the floor, x ahead, z up, amid the wheels)",
+                of_root, f"{x_y_z} m, not turned", "every place that the arm reaches is shifted or turned",
+            ),
+        ]  # fmt: skip
+    turned = "not turned" if not body.root.rpy_rad[2] else f"turned by {degrees(body.root.rpy_rad[2]):.1f} degrees"
+    rows = [
+        Missing(
+            GUESSED, "kind and wheels of the base", "`[base]`",
+            f"{base['kind']}, of the joints {', '.join(rolling.joints)}, whose axles are level",
+            "it drives other ways than were asked for",
+        ),
+        Missing(
+            GUESSED, "where the URDF's root is in the body's frame, and which way is ahead", of_root,
+            f"{x_y_z} m, {turned}: the middle is amid the wheels",
+            "every place that the arm reaches is shifted or turned",
+        ),
+        Missing(
+            NEVER, "width and height of the base, its mass with battery and electronics, its top speed, its bumper",
+            "`[base]`",
+            f"{base['chassis_diameter_m']:g} m and {base['chassis_height_m']:g} m; {base['mass_kg']:g} kg, of which"
+            f" {LOAD_KG:g} kg are not the URDF's; {base['max_wheel_speed_mps']:g} m/s; none",
+            "it touches what it drives past, or keeps too far off",
+        ),
+        Missing(
+            NEVER, "the way in which each wheel's servo turns it", "`[base]`",
+            "forwards is positive about the URDF's axis",
+            "the base drives another way than it was told: set it before it stands on the floor",
+        ),
+    ]  # fmt: skip
+    if rolling.guessed:
+        what = f"radius of the wheels {', '.join(rolling.guessed)}, which have no shape that could be read"
+        where = "`[[base.wheel]] radius_m`" if base["kind"] == "omni" else "`[base] wheel_radius_m`"
+        rows.append(Missing(FILE, what, where, f"{RADIUS_M:g} m each", "it drives other distances than were asked for"))
+    return rows
+
+
+def _guessed(roles: Roles, hand: Hand, body: Body, data: dict[str, Any]) -> list[Missing]:
     arm = data["arm"]
     limb = f"{', '.join(arm['joints'])}; bend {arm['bend']}, roll {arm['roll']}"
     rows = [
@@ -108,23 +149,25 @@ def _guessed(roles: Roles, hand: Hand, data: dict[str, Any]) -> list[Missing]:
             "the hand closes beside things",
         ),
     ]  # fmt: skip
-    if roles.jaws:
-        signs = ", ".join(f"{jaw} {'+' if sign > 0 else '-'}" for jaw, sign in data["claw"]["open_sign"].items())
-        rows.append(
-            Missing(GUESSED, "the way in which the jaws open", "`[claw] open_sign`", signs, "it closes to open")
-        )
-    camera = roles.camera or f"{data['kinect']['link']}, added on a mast"
-    rows.append(
-        Missing(GUESSED, "the camera's place", "`[kinect] link`", camera, "what it sees is taken to be elsewhere")
-    )
-    if len(roles.head) != 2:
+    signs = ", ".join(f"{jaw} {'+' if sign > 0 else '-'}" for jaw, sign in hand.open_sign.items())
+    rows.append(Missing(GUESSED, "the way in which the jaws open", "`[claw] open_sign`", signs, "it closes to open"))
+    if hand.fixed_pad_m is not None:
+        how = "as of the solids beside the tip" if hand.pads_known else "assumed: no solids lie on its two sides alone"
         rows.append(
             Missing(
-                GUESSED, "the joints that turn the camera", "`[head]`",
-                f"{data['head']['pan']} and {data['head']['tilt']}, which are added",
-                "the planner turns joints that are not there",
+                GUESSED, "where the fixed finger is, and the gap to the jaw at its angle 0",
+                "`[claw] fixed_pad_m`, `pad_gap_m`",
+                f"{data['claw']['fixed_pad_m']:g} m and {data['claw']['pad_gap_m']:g} m, {how}",
+                "the hand closes beside things, or pushes them",
             )
         )  # fmt: skip
+    camera = (
+        roles.camera
+        or f"none in the URDF: fixed on the body at {[round(value, 3) for value in body.camera_m]} m,"
+        f" {CAMERA_DOWN_DEG:g} degrees down"
+    )
+    where = "`[kinect] link`" if roles.camera else f"`[[link]]` {data['kinect']['link']}"
+    rows.append(Missing(GUESSED, "the camera's place", where, camera, "what it sees is taken to be elsewhere"))
     idle = [name for name in roles.joints if name not in (*roles.arm, roles.roll, *roles.jaws, *roles.head)]
     if idle:
         rows.append(Missing(GUESSED, "what these joints are for", "`[arm]`", ", ".join(idle), "they hold still"))

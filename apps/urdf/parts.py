@@ -29,26 +29,31 @@ _LEAST_SIDE_M, _GREATEST_SIDE_M = 0.002, 1.0
 class Parts:
     """The parts, pairs of links that touch at angle 0, and the links whose mass is assumed."""
 
-    def __init__(self, urdf: Urdf, rows: Rows, root: Origin, wheels: Iterable[str]) -> None:
-        """`rows` gets another for each shape that lies aslant in its link. The links of `wheels` do not collide."""
+    def __init__(self, urdf: Urdf, rows: Rows, root: Origin, wheels: Iterable[str], rolling: Iterable[str]) -> None:
+        """`rows` gets another for each shape that lies aslant in its link. The links of `wheels` do not collide; those
+        of `rolling`, the joints of `[base]`, become no parts, but their mass counts."""
         self.data: list[dict[str, Any]] = []
         self.weightless: list[str] = []
         self.boxes: dict[str, list[FloatArray]] = {}
         """By link that can collide, the corners (2, 3), body frame, m, of the boxes about its solids at angle 0."""
         self._rows = rows
-        rolling = {urdf.joints[wheel].child for wheel in wheels}
+        still = {urdf.joints[wheel].child for wheel in wheels}
+        made = {urdf.joints[wheel].child for wheel in rolling}
         poses = {name: root.transform() @ pose for name, pose in urdf.poses().items()}
         carrier = carriers(urdf, rows)
         mass_kg = dict.fromkeys(carrier.values(), 0.0)
         for name, link in urdf.links.items():
             on_body = carrier[name] == BODY
             kg = 0.0 if link.inertial is None or link.inertial.mass_kg < _LEAST_KG else link.inertial.mass_kg
+            if name in made:
+                mass_kg[BODY] += kg
+                continue
             for solid in link.solids:
                 place = poses[name] @ solid.place
                 if on_body:
                     share = solid.volume_m3 / sum(one.volume_m3 for one in link.solids)
                     mass = rounded((kg or ASSUMED_MASS_KG) * share)
-                    part = self._on_body(name, solid, place, {"mass_kg": mass, "solid": name not in rolling})
+                    part = self._on_body(name, solid, place, {"mass_kg": mass, "solid": name not in still})
                 else:
                     self._add(name, rows.link[name], solid, solid.place)
                     part = carrier[name]
@@ -135,13 +140,14 @@ def _aligned(place: FloatArray) -> FloatArray | None:
 
 def _corners(solid: Solid, place: FloatArray) -> FloatArray:
     """The least and the greatest corner (2, 3), m, of the box about a shape along the axes that `place` leads to."""
-    half = _half_m(solid)
+    half = half_m(solid)
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     points = (signs * half) @ place[:3, :3].T + place[:3, 3]
     return np.stack((points.min(axis=0), points.max(axis=0)))
 
 
-def _half_m(solid: Solid) -> FloatArray:
+def half_m(solid: Solid) -> FloatArray:
+    """Half the sides (3,), m, of the box about a shape, along the shape's axes."""
     if solid.shape == "box":
         return np.array(solid.size_m) / 2
     radius = solid.size_m[0]

@@ -72,7 +72,7 @@ def roles_of(urdf: Urdf) -> Roles:
     arm, roll = tuple(chain[:-1]), chain[-1]
     jaws = tuple(sorted(below[roll], key=lambda name: not _is_jaw(urdf.joints[name]))[:_MOST_JAWS])
     if not jaws:
-        doubts.append(f"[claw] open_sign: no joint moves behind {roll}, so the hand cannot close")
+        raise UrdfError(f"has no hand that closes: no joint turns behind {roll}, the last one of its arm")
     axes = {name: _axis(urdf, name) for name in chain}
     bends = [two for one, two in pairwise(arm) if abs(float(axes[one] @ axes[two])) > _PARALLEL]
     bend = bends[0] if bends else arm[len(arm) // 2]
@@ -83,7 +83,7 @@ def roles_of(urdf: Urdf) -> Roles:
             f"[arm] joints: the first one is to turn the arm about the vertical, counter-clockwise positive as seen"
             f" from above; the axis of {arm[0]} points to {np.round(axes[arm[0]], 2).tolist()} in the body's frame"
         )
-    tips = [link for link in _rigid_with(urdf, urdf.joints[roll].child) if _TIP.search(link)]
+    tips = [link for link in rigid_with(urdf, urdf.joints[roll].child) if _TIP.search(link)]
     camera, head = _camera(urdf, set(wheels), set(chain) | set(jaws), doubts)
     return Roles(joints, wheels, arm, bend, roll, jaws, tips[-1] if tips else None, camera, head, tuple(doubts))
 
@@ -118,7 +118,7 @@ def _moving_below(urdf: Urdf, joint: UrdfJoint) -> list[str]:
     return found
 
 
-def _rigid_with(urdf: Urdf, link: str) -> list[str]:
+def rigid_with(urdf: Urdf, link: str) -> list[str]:
     """The links behind a link that no joint turns against it."""
     found, waiting = [], [link]
     while waiting:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from apps.urdf.model import HERE, Urdf, UrdfJoint
+from apps.urdf.model import CONTINUOUS, HERE, Urdf, UrdfJoint
 from apps.urdf.values import UrdfError
 from cocoro.arrays import FloatArray
 from cocoro.kinematics import Origin
@@ -37,7 +37,9 @@ class Rows:
         UrdfError when such a joint cannot keep its name."""
         turns = turns or {}
         self.data: list[dict[str, Any]] = []
+        wheels = ("left", "right", *(joint.name for joint in urdf.joints.values() if joint.kind == CONTINUOUS))
         self.taken = {BODY, CHASSIS, MOUNT, *CASTERS}
+        self.taken |= {f"{kind}_{name}" for kind in ("wheel", "hub") for name in wheels}
         self.link: dict[str, str] = {}
         """By the URDF's link, the row with its frame."""
         self.joint: dict[str, str] = {}

@@ -10,13 +10,12 @@ from apps.urdf.missing import Missing
 
 PAGE = "WHAT-IS-MISSING.md"
 _TABLES = {
-    "base": "Assumed. Safety times and acceleration are the Calliope's.",
+    "base": "What is not of the URDF's wheels is assumed. Safety times and acceleration are the Calliope's.",
     "kinect": "Assumed: a Kinect's lens and depth.",
     "head": "The joints that turn the camera.",
     "arm": "Guessed from the joints' order and names.",
     "link": "From the URDF: places of its joints. A joint about another axis than z has two rows.",
-    "marker": "Assumed.",
-    "network": "Assumed: one table a servo line.",
+    "network": "Assumed: one servo line.",
     "joint": "Limits, torque and speed from the URDF where it has them; lines and IDs are to be set.",
     "claw": "Assumed.",
     "hull": "Assumed: balls along the arm.",
@@ -30,6 +29,8 @@ def description_text(data: dict[str, Any], source: str) -> str:
     lines = [f"# Made from {source} by `cocoro new robot`. What is assumed here, and what is missing: {PAGE}.", ""]
     lines.append(f"name = {_value(data['name'])}")
     for table, comment in _TABLES.items():
+        if table not in data:
+            continue
         lines += ["", f"# {comment}", *_table(table, data[table])]
     return "\n".join([*lines, ""])
 
@@ -75,12 +76,16 @@ def _table(name: str, data: Any) -> Iterator[str]:
             yield from _fields(row)
         return
     inner = {key: value for key, value in data.items() if isinstance(value, dict) and name in ("network", "pose")}
-    if plain := {key: value for key, value in data.items() if key not in inner}:
+    rows = {key: value for key, value in data.items() if (name, key) == ("base", "wheel")}
+    if plain := {key: value for key, value in data.items() if key not in inner | rows}:
         yield f"[{name}]"
         yield from _fields(plain)
     for number, (key, value) in enumerate(inner.items()):
         yield from (["", f"[{name}.{_key(key)}]"] if number else [f"[{name}.{_key(key)}]"])
         yield from _fields(value)
+    for key, several in rows.items():
+        for row in several:
+            yield from ["", f"[[{name}.{key}]]", *_fields(row)]
 
 
 def _fields(row: dict[str, Any]) -> Iterator[str]:
