@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import random
 import re
+from math import cos, sin
 from pathlib import Path
 
 import pytest
-from urdf_rig import DESK_ARM, desk_arm
+from urdf_rig import DESK_ARM, desk_arm, rolling_arm, wheel
 
 from apps.urdf.describing import describe
 from apps.urdf.writing import description_text, page_text
@@ -15,13 +16,13 @@ from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from sim.model import build_model
 
+CART = rolling_arm("".join(wheel(f"w{turn}", 0.1 * sin(turn), -0.1 * cos(turn), turn) for turn in (0.0, 2.1, 4.2)))
 NUMBERS = ("0", "-1", "1e20", "1e300", "1e-300", "nan", "3.14159", "1e5")
 NAMES = ("", "body", "chassis", "mount", "caster_front", "upper", "swivel", "continuous", "fixed", "a|b", "\u2028")
 
 
-def damaged(rng: random.Random) -> str:
-    """The desk arm with a few other values, without a few elements, or with a few characters changed."""
-    text = DESK_ARM
+def damaged(text: str, rng: random.Random) -> str:
+    """A URDF with a few other values, without a few elements, or with a few characters changed."""
     for _ in range(rng.randint(1, 3)):
         way = rng.random()
         if way < 0.7:
@@ -40,10 +41,11 @@ def damaged(rng: random.Random) -> str:
 
 
 @pytest.mark.sweep
-def test_a_damaged_file_is_refused_or_makes_a_robot(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", [DESK_ARM, CART], ids=["desk", "cart"])
+def test_a_damaged_file_is_refused_or_makes_a_robot(tmp_path: Path, text: str) -> None:
     made, refusals = 0, []
     for seed in range(300):
-        path = desk_arm(tmp_path, damaged(random.Random(seed)))
+        path = desk_arm(tmp_path, damaged(text, random.Random(seed)))
         try:
             result = describe(path, "desk")
         except ConfigError as error:

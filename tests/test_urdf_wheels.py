@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import cos, pi, radians, sin
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,7 +154,7 @@ def test_a_robot_of_three_wheels_stands_still_and_level(cart: Path) -> None:
 
 @pytest.mark.sim
 @pytest.mark.parametrize(("task", "place"), [("park", {}), ("go-there", {"x_m": 0.2, "y_m": 0.1})])
-def test_it_parks_and_goes_to_a_place(cart: Path, task: str, place: dict[str, float]) -> None:
+def test_it_parks_and_goes_to_a_place(cart: Path, task: str, place: dict[str, Any]) -> None:
     result = rehearse(
         RehearsalRequest(
             task=asked(task, **place).task, description=str(cart), width=320, height=240, frame_rate_hz=15.0

@@ -11,11 +11,13 @@ from apps.urdf.model import Urdf, UrdfJoint
 from apps.urdf.parts import half_m
 from apps.urdf.roles import Roles, rigid_with
 from apps.urdf.rows import turn_to
+from apps.urdf.values import UrdfError
 from cocoro.arrays import FloatArray
 
 _AHEAD_M = 0.05
 """From the jaws' axes to the point between them, where the URDF has no link for it."""
 _LEAST_REACH_M = 0.01
+_LEAST_M = 0.001
 _ALONG = 0.8
 """Least cosine between the z axis of a link and the hand of which it is the tip."""
 _ALONG_ONE = 0.995
@@ -97,6 +99,8 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
         frames[jaw] = np.linalg.inv(child) @ frame
         finger_deg[jaw] = 90.0 * side
         reaches.append(abs(float(y @ (point - pivot))))
+        if reaches[-1] < _LEAST_M:
+            raise UrdfError(f"joint {jaw} turns no jaw: its axis goes through the point that the hand is to grasp with")
         offsets.append(abs(offset))
     pad_m = min(max(min(reaches, default=_GREATEST_PAD_M), _LEAST_PAD_M), _GREATEST_PAD_M)
     gap_m, fixed_m, known = max(_LEAST_GAP_M, 2.0 * max(offsets, default=0.0)), None, False

@@ -51,7 +51,8 @@ class Parts:
             for solid in link.solids:
                 place = poses[name] @ solid.place
                 if on_body:
-                    share = solid.volume_m3 / sum(one.volume_m3 for one in link.solids)
+                    volume_m3 = sum(one.volume_m3 for one in link.solids)  # 0 of what is too small for its cube
+                    share = solid.volume_m3 / volume_m3 if volume_m3 else 1.0 / len(link.solids)
                     mass = rounded((kg or ASSUMED_MASS_KG) * share)
                     part = self._on_body(name, solid, place, {"mass_kg": mass, "solid": name not in still})
                 else:
