@@ -107,10 +107,10 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         self._check_limbs()
         links = {row.name: (row.parent, row.joint) for row in self.link}
         check_camera(self.kinect.link, links, self._head_joints)
-        check_masses(links, [part.link for part in self.solid.part if part.mass_kg > 0.0], self.claw.open_sign)
         check_claw(len(self.claw.open_sign), self.claw.fixed_pad_m)
         check_box("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m)
         check_box("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m)
+        check_masses(links, [part.link for part in self.solid.part if part.mass_kg > 0.0], self.claw.open_sign)
 
     @property
     def _head_joints(self) -> set[str]:
