@@ -167,7 +167,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         limbs = [("claw", set(self.claw.open_sign)), ("head", self._head_joints)]
         limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
-        for where, named in [*poses, *limbs, ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]:
+        for where, named in [*poses, *limbs]:
             if unknown := sorted(named - joints):
                 raise ValueError(f"{where}: there is no joint {unknown[0]!r}")
         moved = {row.joint for row in self.link}

@@ -35,6 +35,7 @@ class Clearance:
         # A finger lies across its claw's own x axis, towards the hand's tip.
         turns_rad = {name: radians(turn_deg) for name, turn_deg in hull.finger_turn_deg.items()}
         self._fingers = {name: np.array([cos(turn), sin(turn), 0.0]) for name, turn in turns_rad.items()}
+        self._at_zero = dict.fromkeys(robot.jaws, 0.0)
         radii = [tube.radius_m for tube in hull.tube for _ in range(tube.balls)]
         self._radii = np.array(radii + [hull.finger_radius_m] * (len(_ALONG_FINGER) * len(self._fingers)))
         self._tree = robot.tree(*(name for tube in hull.tube for name in (tube.start, tube.end)), *self._fingers)
@@ -53,7 +54,7 @@ class Clearance:
 
         `angles`: radians, of every joint of the arm; a claw's is taken to be 0 where it is missing.
         """
-        angles = dict.fromkeys(self._fingers, 0.0) | dict(angles)
+        angles = self._at_zero | dict(angles)
         poses = self._tree.poses(angles)
         balls: list[FloatArray] = []
         for start, end, share in self._tubes:

@@ -7,7 +7,7 @@ neck turns the body itself, so its pan is the heading of the camera in the odome
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import asin, atan2, cos, hypot, inf, pi, tan
+from math import asin, atan2, cos, inf, pi, sin, tan
 from typing import Protocol
 
 import numpy as np
@@ -199,9 +199,9 @@ class BaseAsNeck:
         pose = robot.camera_chain.pose({})
         self._into_camera = np.linalg.inv(pose)
         x, y, self._up_m = pose[:3, 3].tolist()
-        self._ahead_m = hypot(x, y)
         along = pose[:3, 2]
         self._on_body = atan2(along[1], along[0]), asin(min(max(float(along[2]), -1.0), 1.0))
+        self._ahead_m = x * cos(self._on_body[0]) + y * sin(self._on_body[0])
         self.limits_rad = (-pi, pi), (self._on_body[1], self._on_body[1])
         self._half_view = _half_view_rad(robot, config)
         self.nearest_m, self.farthest_m = self._floor_m()
