@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from cocoro.base import Base
 from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses
-from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker
+from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker, Reach
 from cocoro.errors import ConfigError
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
 from cocoro.link_row import LinkRow
@@ -88,6 +88,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     head: Head | None = None
     link: list[LinkRow]
     arm: Arm
+    reach: Reach | UnsetType = UNSET
     marker: Marker | None = None
     """Without it the robot learns nothing from the sight of its hand."""
     network: dict[LineName, Network]

@@ -52,6 +52,30 @@ class Kinect(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return None if low_m is None or high_m is None else (low_m, high_m)
 
 
+class Reach(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the arm works: distances of `arm.tip` from the axis of the arm's first joint, and heights. Without this table
+    the planner takes those of its own settings, which are a Calliope's; what a profile sets there is before either."""
+
+    grasp_radius_m: Positive
+    """Preferred distance of a target for grasping."""
+    grasp_radius_range_m: tuple[Positive, Positive]
+    touch_radius_range_m: tuple[Positive, Positive]
+    retreat_radius_m: Positive
+    """Where the hand waits behind a target before it closes in: the smallest distance that the arm reaches."""
+    travel_radius_m: Positive
+    travel_height_m: Positive
+    """Where the hand is carried empty."""
+    carry_radius_m: Positive
+    carry_rise_m: Positive
+    """Height at which an object is carried above where it was grasped."""
+
+    def __post_init__(self) -> None:
+        for name in ("grasp_radius_range_m", "touch_radius_range_m"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"reach.{name} must rise, not {[low, high]}")
+
+
 class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The ball on the hand that babbling looks at; `position_m` is in the link's frame."""
 

@@ -60,6 +60,7 @@ class Robot:
         self.kinect = spec.kinect
         self.head = spec.head
         self.arm = spec.arm
+        self.reach = None if spec.reach is UNSET else spec.reach
         self.marker = spec.marker
         self.networks: dict[str, Network] = spec.network
         """The serial lines by name."""

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from cocoro.description_limbs import Reach
 from cocoro.units import Positive
 
 
@@ -161,6 +162,15 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The goals of all joints wait for one that lags by more: up to 0.15 rad are seen where nothing is late."""
     wait_s: Positive = 0.5
     """Longest wait: a link that lost a packet has repeated it by then."""
+
+
+def of_body(config: ArmConfig, reach: Reach | None) -> ArmConfig:
+    """The settings with what the robot's description says of its reach, where they are the planner's own."""
+    if reach is None:
+        return config
+    own, told = ArmConfig(), msgspec.structs.asdict(reach)
+    left = {name: value for name, value in told.items() if getattr(config, name) == getattr(own, name)}
+    return msgspec.structs.replace(config, **left)
 
 
 class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
