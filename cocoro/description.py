@@ -22,6 +22,8 @@ from cocoro.link_row import LinkRow
 from cocoro.units import Vec3
 
 OWN_FILE = "calliope.toml"
+SHIPPED = ("calliope", "lekiwi")
+"""Robots whose descriptions the project ships: where a file is asked for, the bare name is that description."""
 _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
 
 
@@ -184,11 +186,11 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def read(path: Path | None, override: Path | None) -> Description:
-    """Read the description in `path` (None: the Calliope's), with the values of `override` in place of its own. Raises
-    ConfigError naming file and field."""
+    """Read the description in `path`, a file or one of `SHIPPED` (None: the Calliope's), with the values of `override`
+    in place of its own. Raises ConfigError naming file and field."""
     where = str(path or OWN_FILE)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8") if path else _own_text())
+        data = tomllib.loads(_text(where))
         if override is not None:
             where = str(override)
             _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
@@ -199,8 +201,17 @@ def read(path: Path | None, override: Path | None) -> Description:
         raise ConfigError(f"robot description {where}: {error}{advice}") from error
 
 
-def _own_text() -> str:
-    return resources.files("cocoro").joinpath(OWN_FILE).read_text(encoding="utf-8")
+def is_shipped(file: str | Path) -> bool:
+    """Whether a description is asked for by the name of a robot that the project ships, and not by its file."""
+    return str(file) in SHIPPED
+
+
+def _text(where: str) -> str:
+    if is_shipped(where):
+        where = f"{where}.toml"
+    elif where != OWN_FILE:
+        return Path(where).read_text(encoding="utf-8")
+    return resources.files("cocoro").joinpath(where).read_text(encoding="utf-8")
 
 
 def completed(data: Any) -> Any:
@@ -208,7 +219,7 @@ def completed(data: Any) -> Any:
     if not isinstance(data, dict):
         return data
     claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
-    own = tomllib.loads(_own_text())
+    own = tomllib.loads(_text("calliope"))
     for table in ("hull", "head", "arm", "solid"):
         data = {table: own[table], **data}
     if isinstance(claw, dict):

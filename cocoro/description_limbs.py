@@ -53,8 +53,10 @@ class Kinect(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Reach(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the arm works: distances of `arm.tip` from the axis of the arm's first joint, and heights. Without this table
-    the planner takes those of its own settings, which are a Calliope's; what a profile sets there is before either."""
+    """Where the arm works: distances of `arm.tip` from the axis of the arm's first joint, and heights.
+
+    Without this table the planner takes those of its own settings, which are a Calliope's. What a profile sets there
+    counts before either."""
 
     grasp_radius_m: Positive
     """Preferred distance of a target for grasping."""

@@ -25,6 +25,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.component import Component
+from cocoro.description import is_shipped
 from cocoro.errors import ConfigError, choice_of, field_text
 from deploy.mesh_table import Mesh
 from deploy.processes import named, needs
@@ -56,7 +57,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     processes: Annotated[tuple[Name, ...], Meta(min_length=1)]
     """The components that are started, in this order; they are stopped in reverse order."""
     description: str | None = None
-    """A robot description file instead of the Calliope's."""
+    """A robot description file instead of the Calliope's, or the name of a robot that the project ships."""
     measured: str | None = None
     """A file of values measured on this robot; they override the description."""
     objects: str | None = None
@@ -73,7 +74,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def with_robot(self, description: Path | None, measured: Path | None) -> Profile:
         """A profile like this one with another description or measured file; None keeps its own."""
         files = {"description": description, "measured": measured}
-        given = {name: str(file.resolve()) for name, file in files.items() if file is not None}
+        given = {n: str(f if is_shipped(f) else f.resolve()) for n, f in files.items() if f is not None}
         return msgspec.structs.replace(self, **given)
 
     def rows(self) -> tuple[Component, ...]:
@@ -206,6 +207,6 @@ def _override(data: dict[str, Any], override: str) -> None:
 
 
 def _absolute(file: str | None, home: Path | None) -> str | None:
-    if file is None or home is None:
+    if file is None or home is None or is_shipped(file):
         return file
     return str((home / file).resolve())

@@ -108,7 +108,9 @@ BodyOption = Annotated[
 ]
 DescriptionOption = Annotated[
     Path | None,
-    typer.Option("--description", metavar="FILE", help="Description of the robot, if it is not the Calliope."),
+    typer.Option(
+        "--description", metavar="FILE", help="Description of the robot, if it is not the Calliope, or: lekiwi."
+    ),
 ]
 MeasuredOption = Annotated[
     Path | None,

@@ -29,7 +29,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     body: BodyKind = "nominal"
     """Worn: lengths, joint zeros, camera, marker and wheels differ from the nominal model, drawn by the seed."""
     description: str | None = None
-    """File of a robot description in place of the Calliope's."""
+    """File of a robot description in place of the Calliope's, or the name of a robot that the project ships."""
     measured: str | None = None
     """File of the values measured on one robot; they replace the description's."""
     model: str | None = None
