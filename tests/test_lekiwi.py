@@ -6,6 +6,7 @@ import re
 from importlib import resources
 from math import degrees, radians
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
 from deploy.profiles import from_data, read
 from services.planning.clearance import Clearance
-from services.planning.config import ArmConfig, HeadConfig, PlanningConfig, of_body
+from services.planning.config import ArmConfig, HandConfig, HeadConfig, PlanningConfig, of_body
 from services.planning.core import PlanningCore
 from services.planning.gaze import BaseAsNeck, gaze_of
+from services.planning.hand import widest_m
 from services.planning.reach import HandPose, Reacher
 from sim.world import World
 
@@ -34,8 +36,7 @@ name = "by the can"
 [[object]]
 label = "red_can"
 shape = "cylinder"
-radius_m = 0.02
-height_m = 0.10
+SIZE
 position_m = [0.7, 0.1]
 """
 
@@ -108,6 +109,11 @@ def test_what_a_profile_sets_counts_before_the_descriptions_reach(lekiwi: Robot,
         Robot.from_data(data)
 
 
+def test_the_open_hand_takes_what_fits_between_its_pads(lekiwi: Robot, robot: Robot) -> None:
+    assert 0.045 < widest_m(lekiwi, HandConfig()) < 0.06
+    assert widest_m(robot, HandConfig()) == pytest.approx(0.072 + 2 * 0.0686 * np.sin(0.42), abs=0.001)
+
+
 def test_a_finger_is_named_by_its_link_and_closed_where_its_joint_is_not_told(lekiwi: Robot) -> None:
     assert list(lekiwi.hull.finger_turn_deg) == [lekiwi.link_of("gripper")] != ["gripper"]
     clearance, arm = Clearance(lekiwi), dict.fromkeys(lekiwi.joints, 0.0)
@@ -171,21 +177,34 @@ def test_it_stands_moves_every_joint_and_drives_in_every_direction(lekiwi: Robot
         assert yaw_of(truth) > 0.8
 
 
-@pytest.mark.sim
-def test_it_finds_approaches_grasps_and_lifts_a_small_can(tmp_path: Path) -> None:
+def fetched(tmp_path: Path, radius_m: float, height_m: float) -> dict[str, Any]:
+    """The result of fetching a can of this size."""
     text = resources.files("cocoro").joinpath("objects.toml").read_text(encoding="utf-8")
-    small = text.replace("radius_m = 0.033\nheight_m = 0.120", "radius_m = 0.020\nheight_m = 0.100")
+    size = f"radius_m = {radius_m}\nheight_m = {height_m}"
     scene, objects = tmp_path / "scene.toml", tmp_path / "objects.toml"
-    scene.write_text(BY_THE_CAN, encoding="utf-8")
-    objects.write_text(small, encoding="utf-8")
-    result = rehearse(
+    scene.write_text(BY_THE_CAN.replace("SIZE", size), encoding="utf-8")
+    objects.write_text(text.replace("radius_m = 0.033\nheight_m = 0.120", size), encoding="utf-8")
+    return rehearse(
         RehearsalRequest(
             task=asked("fetch", "red_can").task, scene=str(scene), description="lekiwi", objects=str(objects),
             width=320, height=240, frame_rate_hz=15.0,
         )
     )  # fmt: skip
+
+
+@pytest.mark.sim
+def test_it_finds_approaches_grasps_and_lifts_a_small_can(tmp_path: Path) -> None:
+    result = fetched(tmp_path, 0.02, 0.1)
     assert (result["outcome"], result["reason"]) == ("done", "")
     assert result["truth"]["held"]
     assert result["truth"]["lifted_m"] > 0.08
     assert not result["truth"]["collisions"]
     assert not result["truth"]["knocked_over"]
+
+
+@pytest.mark.sim
+def test_what_is_wider_than_the_open_hand_is_left_alone(tmp_path: Path) -> None:
+    result = fetched(tmp_path, 0.033, 0.12)
+    assert result["outcome"] == "failed"
+    assert "66 mm wide" in result["reason"]
+    assert result["truth"]["target_moved_m"] < 0.002

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import sin
+
 import numpy as np
 
 from cocoro.messages import ServoCommand, ServoState
@@ -20,6 +22,17 @@ def aside_m(robot: Robot, width_m: float, room_m: float) -> float:
     along = hand[:3, 2]
     left = np.array([-along[1], along[0], 0.0]) / max(float(np.hypot(along[0], along[1])), 1e-6)
     return float((robot.claw.fixed_pad_m - width_m / 2 - room_m) * (jaw[:3, 0] @ left))
+
+
+def widest_m(robot: Robot, config: HandConfig) -> float:
+    """Greatest width, m, of a thing that the open hand goes around, the room beside a fixed finger taken off."""
+    zero, claw = dict.fromkeys(robot.joints, 0.0), robot.claw
+    tip = robot.chain(robot.arm.tip).pose(zero)
+    width_m = claw.pad_gap_m
+    for jaw in robot.jaws:
+        pad = np.linalg.inv(robot.chain(robot.link_of(jaw)).pose(zero)) @ tip
+        width_m += abs(float(pad[1, 3])) * sin(config.open_rad)
+    return width_m if claw.fixed_pad_m is None else width_m - config.fixed_finger_room_m
 
 
 class Grip:

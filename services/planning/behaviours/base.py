@@ -19,7 +19,7 @@ from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import FloorMap
 from services.planning.gaze import Gaze, gaze_of
-from services.planning.hand import Grip, aside_m
+from services.planning.hand import Grip, aside_m, widest_m
 from services.planning.head import Aim, CameraTilt
 from services.planning.navigation import GENTLE, Driver
 from services.planning.reach import HandPose, Reacher
@@ -59,6 +59,7 @@ class Actuators:
         self.reacher = Reacher(robot, config.arm.damping)
         self.arm = ArmController(robot, config.arm, self.reacher)
         self.grip = Grip(robot, config.hand)
+        self.widest_m = widest_m(robot, config.hand)
         self.gaze = gaze_of(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
@@ -184,6 +185,13 @@ class Snapshot:
         """How far to the left of a target's centre, m, the hand's axis goes to grasp it."""
         room_m = self.actuators.config.hand.fixed_finger_room_m
         return aside_m(self.actuators.robot, self.estimator.width_m(label), room_m)
+
+    def too_wide(self, label: str) -> str:
+        """The reason for which the open hand does not go around a target; '' when it does."""
+        width_m, most_m = self.estimator.width_m(label), self.actuators.widest_m
+        return (
+            f"it is {1e3 * width_m:.0f} mm wide, the open hand takes {1e3 * most_m:.0f} mm" if width_m > most_m else ""
+        )
 
     def at_rest(self, target: TargetEstimate) -> Vec3:
         """Where a target will be, body frame, m, when the robot has braked."""

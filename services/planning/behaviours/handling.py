@@ -39,7 +39,10 @@ class Reaching:
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
             aside_m = snapshot.aside_m(self._label)
-            why_not = actuators.reachability.why_not(snapshot.at_rest(target), aside_m, touching=self._touching)
+            why_not = "" if self._touching else snapshot.too_wide(self._label)
+            why_not = why_not or actuators.reachability.why_not(
+                snapshot.at_rest(target), aside_m, touching=self._touching
+            )
             if why_not:
                 return Plan(snapshot.stand(), snapshot.still(), why_not, None, "failed", "unreachable")
         actuators.grip.open()
