@@ -14,10 +14,11 @@ from cocoro.tasks import Task
 
 
 def described(kind: type[Task]) -> TaskKind:
-    """One task with its options. An option of another type than text, number or yes and no is left out; so is one that
-    the command line does not have either."""
-    options = [_option(field) for field in msgspec.structs.fields(kind) if field.name != "label"]
-    labels = [field for field in msgspec.structs.fields(kind) if field.name == "label"]
+    """One task with its options; a label that names no object is one. An option of another type than text, number or
+    yes and no is left out; so is one that the command line does not have either."""
+    fields = msgspec.structs.fields(kind)
+    labels = [field for field in fields if field.name == "label" and kind.needs_label]
+    options = [_option(field) for field in fields if field not in labels]
     return TaskKind(
         name=kind.tag(),
         doc=inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("\n", " "),

@@ -122,6 +122,8 @@ class Task(Tagged, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
     """The phase at whose end the command line's `--snapshot` takes its picture; '' gives no such option."""
     pursuit_phase: ClassVar[str] = ""
     """The phase in which the robot keeps behind a moving object; rehearsals judge it. '' for none."""
+    services: ClassVar[tuple[str, ...]] = ()
+    """Services that it needs beside those that every task needs."""
     samples: ClassVar[Topic[Any] | None] = None
     """The topic on which it reports samples for learning. Such a task has the fields `first` (number to go on with)
     and `count`."""

@@ -204,6 +204,12 @@ MODEL = Topic(
     "planning/model", m.LearnedModel, Qos.EVENT, None, 1.0,
     "The learned model that the planner has accepted.", max_bytes=8 * 1024 * 1024,
 )  # fmt: skip
+POLICY_ACTIONS = Topic(
+    "policy/actions", m.PolicyActions, Qos.STATE, None, 1.0,
+    "A chunk of actions that a learned policy proposes. The planner follows it row by row, within all limits; a chunk "
+    "that is used up or too old counts no more, and the robot stands.",
+    max_bytes=262_144,
+)  # fmt: skip
 INTENT = Topic(
     "executive/intent", m.Intent, Qos.COMMAND, 50.0, 0.3,
     "The wanted behaviour. The wheels stop after `command_timeout_s`; beyond its age the planner becomes idle.",
@@ -247,8 +253,8 @@ RECORDING = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, OBSTACLES, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
-    HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
+    DETECTIONS, OBSTACLES, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, POLICY_ACTIONS, INTENT, TASK,
+    LATCH, CLOCK, TRUTH, HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
 )  # fmt: skip
 
 RUN = Request(

@@ -12,8 +12,8 @@ from cocoro.errors import ConfigError
 
 PROJECT = "cocoro-mesh"
 EXTRAS = (
-    "operator", "cockpit", "robot", "sim", "site", "view", "tables", "lerobot", "foxglove", "experiments", "bench",
-    "dev",
+    "operator", "cockpit", "robot", "sim", "site", "view", "tables", "lerobot", "foxglove", "policy", "experiments",
+    "bench", "dev",
 )  # fmt: skip
 """The extras, from the smallest on; of several that have a library the first is advised."""
 NEEDED = {"rehearse": "sim", "experiment": "sim"}

@@ -24,6 +24,7 @@ from services.frames.component import PACKER, UNPACKER, UNPACKER_PREFIX, unpacke
 from services.kinect.component import KINECT
 from services.perception.component import PERCEPTION
 from services.planning.component import PLANNING
+from services.policy.component import POLICY
 from services.servos.component import SERVOS
 from sim.component import SIM
 from sim.wire.component import WIRE
@@ -34,6 +35,7 @@ SETTLED_S = 30.0
 
 COMPONENTS: tuple[Component, ...] = (
     SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, COCKPIT, WIRE, GATEWAY, PACKER, UNPACKER,
+    POLICY,
 )  # fmt: skip
 """The project's own."""
 

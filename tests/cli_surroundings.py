@@ -25,6 +25,7 @@ ARGUMENTS: dict[str, str] = {
     "touch": "{name}",
     "go-to": "{name}",
     "go-there": "--x 1 --y 0",
+    "policy": "{name}",
     "rehearse fetch": "{name} --seed -1",
     "snapshot": "{name}.png",
     "record": "--out {name}",

@@ -10,7 +10,7 @@ import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from cocoro.messages import LARGEST, FloorPlan, Frame, Intent, Message, ServoCommand, ServoState
+from cocoro.messages import LARGEST, FloorPlan, Frame, Intent, Message, PolicyActions, ServoCommand, ServoState
 from cocoro.messages.actions import ACTIONS
 from cocoro.topics import REQUESTS, TOPICS
 
@@ -36,6 +36,8 @@ def _data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
     if issubclass(kind, Intent):
         actions = [_fields(inspect.type_info(each)) for each in ACTIONS.own.values()]
         return st.builds(_intent, fields, st.one_of(actions))
+    if issubclass(kind, PolicyActions):
+        return st.builds(_policy_actions, fields, st.integers(1, 3), st.integers(0, 3))
     if issubclass(kind, ServoState | ServoCommand):
         return st.builds(_servos, st.just(kind), fields, st.integers(0, 9))
     return fields
@@ -86,6 +88,12 @@ def _frame(fields: Data, width: int, height: int) -> Data:
 
 def _floor_plan(fields: Data, width: int, height: int) -> Data:
     return fields | {"width": width, "height": height, "cells": bytes(width * height)}
+
+
+def _policy_actions(fields: Data, rows: int, joints: int) -> Data:
+    base = {name: [(fields.get(name) or [0.5])[0]] * rows for name in ("ahead_mps", "turn_radps")}
+    names = [f"joint_{number}" for number in range(joints)]
+    return fields | base | {"joints": names, "goal_rad": [[0.5] * joints] * rows, "period_s": 0.1}
 
 
 def _servos(kind: type[Message], fields: Data, joints: int) -> Data:

@@ -16,11 +16,12 @@ from lerobot_rig import GOLDEN, JOINTS, SPEED, TURN, WHOLE, Told, angle, at, epi
 from omni_robot import omni_robot
 
 from apps.captures.export import lerobot
-from apps.captures.export.lerobot_episodes import NotAnEpisodeError, Recording, camera_rate_hz, names_of, recorded_tasks
+from apps.captures.export.lerobot_episodes import NotAnEpisodeError, Recording, camera_rate_hz, recorded_tasks
 from apps.captures.export.lerobot_stats import QUANTILES, PictureStats, of_values
 from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.tables import Tables
+from cocoro.features import names_of
 from cocoro.messages import Frame
 
 

@@ -13,11 +13,12 @@ import pytest
 from capture_rig import ROBOT
 from lerobot_rig import GOLDEN, SPEED, WHOLE, Told, episode_of, recorded
 
-from apps.captures.export.lerobot_episodes import BASE_NAMES, Recording, names_of, recorded_tasks
+from apps.captures.export.lerobot_episodes import Recording, recorded_tasks
 from apps.captures.export.lerobot_stats import QUANTILES
 from apps.cli.main import main
 from cocoro.arrays import ImageArray
 from cocoro.capture.tables import Tables
+from cocoro.features import BASE_NAMES, names_of
 
 
 @pytest.fixture(scope="module")

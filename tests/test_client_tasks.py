@@ -92,6 +92,7 @@ ASKED: list[tuple[Callable[[RobotClient], TaskHandle], dict[str, Any]]] = [
     (lambda robot: robot.touch("red_can"), {"task": "touch", "label": "red_can"}),
     (lambda robot: robot.go_to("mug", distance_m=0.3), {"task": "go-to", "label": "mug", "distance_m": 0.3}),
     (lambda robot: robot.go_there(1.0, -0.5), {"task": "go-there", "x_m": 1.0, "y_m": -0.5}),
+    (lambda robot: robot.policy("reach", for_s=5.0), {"task": "policy", "label": "reach", "for_s": 5.0}),
     (lambda robot: robot.put_down(), {"task": "put-down", "x_m": None, "y_m": None}),
     (lambda robot: robot.put_down(x_m=1.0, y_m=0.5), {"task": "put-down", "x_m": 1.0, "y_m": 0.5}),
     (lambda robot: robot.park(), {"task": "park"}),

@@ -38,6 +38,15 @@ def labels() -> Iterable[str]:
 
 
 @_names
+def policies() -> Iterable[str]:
+    """Learned policies that the profiles of the robots name which are up here."""
+    from deploy.rundir import robots
+
+    tables = (run_dir.resolved().get("service", {}).get("policy", {}) for run_dir in robots())
+    return [name for table in tables for name in table.get("policies", {})]
+
+
+@_names
 def scenes() -> Iterable[str]:
     from sim.scene_names import GENERATED, scene_names
 

@@ -265,7 +265,7 @@ def command_of(kind: type[Task], shared: Shared) -> Callable[..., None]:
         left_out.add("samples")
     hints = get_type_hints(shared, include_extras=True)
     fields = [field for field in msgspec.structs.fields(kind) if _is_option(field)]
-    parameters = [_parameter(field) for field in fields]
+    parameters = [_parameter(field, kind) for field in fields]
     parameters += [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in inspect.signature(shared).parameters.items()
@@ -292,13 +292,15 @@ def _is_option(field: msgspec.structs.FieldInfo) -> bool:
     return all((meta.extra or {}).get("option", True) for meta in metas)
 
 
-def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
-    """A field as typer has it: `label` is the argument, every other one an option, named without its unit."""
+def _parameter(field: msgspec.structs.FieldInfo, task: type[Task]) -> inspect.Parameter:
+    """A field as typer has it: `label` is the argument, every other one an option, named without its unit. A label that
+    names no object is a policy's name."""
     plain, optional, metas = _unwrapped(field.type)
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(metavar="LABEL", help=text, autocompletion=completions.labels)]
+        word, complete = ("LABEL", completions.labels) if task.needs_label else ("NAME", completions.policies)
+        annotation = _ANNOTATED[plain, typer.Argument(metavar=word, help=text, autocompletion=complete)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

@@ -194,6 +194,9 @@ class BlockingRobot:
     def go_there(self, x_m: float, y_m: float, **options: Any) -> TaskResult:
         return self._done(lambda: self._robot.go_there(x_m, y_m, **options))
 
+    def policy(self, name: str, *, for_s: float | None = None, **options: Any) -> TaskResult:
+        return self._done(lambda: self._robot.policy(name, for_s=for_s, **options))
+
     def put_down(self, *, x_m: float | None = None, y_m: float | None = None, **options: Any) -> TaskResult:
         return self._done(lambda: self._robot.put_down(x_m=x_m, y_m=y_m, **options))
 

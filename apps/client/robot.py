@@ -25,7 +25,16 @@ from cocoro.robot import Robot
 from cocoro.task_errors import refusal
 from cocoro.tasks import Task
 from cocoro.topics import CANCEL, OBJECTS, REPORT, Topic
-from services.executive.tasks import FetchTask, FollowTask, GoThereTask, GoToTask, ParkTask, PutDownTask, TouchTask
+from services.executive.tasks import (
+    FetchTask,
+    FollowTask,
+    GoThereTask,
+    GoToTask,
+    ParkTask,
+    PolicyTask,
+    PutDownTask,
+    TouchTask,
+)
 
 M = TypeVar("M", bound=Message)
 
@@ -98,6 +107,10 @@ class RobotClient:
     def go_there(self, x_m: float, y_m: float, **options: Any) -> TaskHandle:
         """Drive to a place on the floor, odometry frame, around what stands in the way."""
         return self.run(GoThereTask(x_m=x_m, y_m=y_m), **options)
+
+    def policy(self, name: str, *, for_s: float | None = None, **options: Any) -> TaskHandle:
+        """Let a learned policy move the robot, within all limits, for a time or until it says that it has finished."""
+        return self.run(PolicyTask(label=name, for_s=for_s), **options)
 
     def put_down(self, *, x_m: float | None = None, y_m: float | None = None, **options: Any) -> TaskHandle:
         """Set down what the hand holds: here, or at a place on the floor, odometry frame, which needs both."""

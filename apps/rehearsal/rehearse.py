@@ -76,7 +76,7 @@ class _Rehearsal:
         self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
         self._task: Task = request.task
         """The task that runs now."""
-        self._scene = find_scene(request.scene, request.seed, self._task.target, request.objects or "")
+        self._scene = find_scene(request.scene, request.seed, self._wanted(self._task), request.objects or "")
         self._judge = self._judge_of(self._task)
         self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, self._present(self._task))
@@ -100,7 +100,8 @@ class _Rehearsal:
         cycle = LockstepCycle()
         async with AsyncExitStack() as stack:
             services = []
-            for name in (*((RECORDER,) if request.record else ()), *PROCESSES):
+            more = dict.fromkeys(service for task in (request.task, *request.then) for service in task.services)
+            for name in (*((RECORDER,) if request.record else ()), *PROCESSES, *more):
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
                 row = LOCKSTEP_PLANNER if lockstep and name == "planning" else named(name)
                 component = load(row)
@@ -146,6 +147,11 @@ class _Rehearsal:
             raise CocoroError(self._recording.fault)
         return self._result(state)
 
+    @staticmethod
+    def _wanted(task: Task) -> str:
+        """The object that the scene must have; '' for a task that names none."""
+        return task.target if task.needs_label else ""
+
     def _present(self, task: Task) -> str:
         """The task's target, or '' where the scene has no such object."""
         return task.target if task.target in [item.label for item in self._scene.objects] else ""
@@ -174,8 +180,10 @@ class _Rehearsal:
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz", "camera_process")
             }
-            world |= {"target": request.task.target, "bend_at_s": request.bend_s}
+            world |= {"target": self._wanted(request.task), "bend_at_s": request.bend_s}
             return world | held
+        if name == "policy":
+            return {"anything": True}  # who rehearses may run any program here
         if name == "planning":
             return {
                 "model": request.model or "", "reach": request.reach, "see_hand": request.see_hand,

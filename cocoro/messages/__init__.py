@@ -75,6 +75,7 @@ from cocoro.messages.planning import (
     TargetEstimate,
     WheelTrial,
 )
+from cocoro.messages.policy import PolicyActions
 from cocoro.messages.sim import ClockTick, TrueObject, Truth
 from cocoro.messages.stop import EstopReply, EstopRequest, Latch, ResetRequest
 
@@ -124,6 +125,7 @@ __all__ = [
     "PackedRequest",
     "Phase",
     "PlannerStatus",
+    "PolicyActions",
     "Recording",
     "RecoverReply",
     "RecoverRequest",

@@ -110,6 +110,12 @@ class GoThere(Action, frozen=True, tag="go-there"):
     """Where the body's centre is to be at the end, odometry frame."""
 
 
+class FollowPolicy(Action, frozen=True, tag="policy"):
+    """Do what the learned policy of this name proposes, as far as it is safe. Ends when the policy says so."""
+
+    label: str
+
+
 class BabbleArm(Action, frozen=True, tag="babble-arm"):
     """Move the arm from draw to draw and report where the hand is seen."""
 
@@ -139,7 +145,7 @@ ACTIONS: Registry[Action] = Registry(
     "action",
     (
         Idle, Park, Search, Explore, Approach, Reach, Close, Lift, Carry, PutDown, Follow, Touch, GoTo, GoThere, Drive,
-        BabbleArm, BabbleWheels,
+        FollowPolicy, BabbleArm, BabbleWheels,
     ),
     _brought,
 )  # fmt: skip

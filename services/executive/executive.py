@@ -148,7 +148,7 @@ class Executive:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if stopped := self._estop.refusal:
             return "estop", stopped
-        missing = [service for service in self._config.needed if service not in self._alive]
+        missing = [service for service in (*self._config.needed, *task.services) if service not in self._alive]
         if missing:
             return "not_alive", f"{self._what_of(missing)}; see cocoro status"
         if self._unreadable:

@@ -188,16 +188,16 @@ class Caution:
 
     def _arm_meets(self, move: Move, arm: ArmHull, body: Pose2, fields: Fields, driver: Driver) -> bool:
         poses = driver.stopping_poses(move.speed_mps, move.turn_radps, turning=True)
-        now_m = self._room(arm, body, fields)
-        then_m = np.min([self._room(arm, body.compose(pose), fields) for pose in poses], axis=0)
+        now_m = room_m(arm, body, fields)
+        then_m = np.min([room_m(arm, body.compose(pose), fields) for pose in poses], axis=0)
         return bool((then_m < np.minimum(now_m, self._config.hull_m)).any())
 
-    @staticmethod
-    def _room(arm: ArmHull, body: Pose2, fields: Fields) -> FloatArray:
-        """Distance of each ball from obstacles, (n,), m."""
-        places = placed(arm.places_m, body)
-        room: FloatArray = np.where(arm.low, fields.body.at(places), fields.arm.at(places)) - arm.radii_m
-        return room
+
+def room_m(arm: ArmHull, body: Pose2, fields: Fields) -> FloatArray:
+    """Distance of each ball from obstacles, (n,), m."""
+    places = placed(arm.places_m, body)
+    room: FloatArray = np.where(arm.low, fields.body.at(places), fields.arm.at(places)) - arm.radii_m
+    return room
 
 
 def limited(value: float, limit: float) -> float:

@@ -16,6 +16,7 @@ from cocoro.topics import (
     MODEL,
     OBSTACLES,
     PLAN,
+    POLICY_ACTIONS,
     WHEEL_TRIALS,
 )
 
@@ -23,7 +24,7 @@ PLANNING = Component(
     name="planning",
     module="services.planning.service",
     doc="Turns intent and the latest state into head, wheel, arm and hand commands, 50 times a second.",
-    reads=(INTENT, BASE_STATE, ARM_STATE, HAND_STATE, DETECTIONS, OBSTACLES, MODEL),
+    reads=(INTENT, BASE_STATE, ARM_STATE, HAND_STATE, DETECTIONS, OBSTACLES, MODEL, POLICY_ACTIONS),
     publishes=(BASE_COMMAND, ARM_COMMAND, HAND_COMMAND, PLAN, FLOOR_PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL),
     serves=(LEARNED,),
     needs=("base", "arm", "hand", "perception"),

@@ -235,6 +235,23 @@ class ByHandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """So long after the operator moved the head it looks by itself at unseen floor ahead."""
 
 
+class PolicyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Following the actions that a learned policy proposes. Base and hull have the limits of `ByHandConfig`."""
+
+    start_s: Positive = 60.0
+    """Longest wait for the first actions: the policy is loaded meanwhile."""
+    silent_s: Positive = 1.0
+    """So long without actions that count the robot stands; then the task fails."""
+    hold_s: Annotated[float, Meta(ge=0)] = 0.15
+    """The last row of a chunk counts for so long after its own period, while the next chunk is late."""
+    oldest_s: Positive = 2.0
+    """Rows of a later time after the observation do not count: too much may have changed since."""
+    ahead_s: Positive = 0.15
+    """The arm's hull is kept from obstacles where it will be after this time."""
+    grip_rad: Positive = 0.05
+    """Jaws whose goals are further than this from where they are open or close."""
+
+
 class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Correction of the reach by the sight of the own hand."""
 
@@ -275,6 +292,7 @@ class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hand: HandConfig = HandConfig()
     follow: FollowConfig = FollowConfig()
     by_hand: ByHandConfig = ByHandConfig()
+    policy: PolicyConfig = PolicyConfig()
     blind_periods: Positive = 2.0
     """The robot drives on without news of perception for this many of perception's own periods where that is longer
     than `Base.command_timeout_s`, so that a slow perception does not stop it."""

@@ -73,6 +73,7 @@ class PlanningCore:
         topics.OBSTACLES: "all",
         topics.INTENT: "latest",
         topics.MODEL: "all",
+        topics.POLICY_ACTIONS: "latest",
     }
 
     @property

@@ -57,6 +57,11 @@ class Grip:
     def close(self) -> None:
         self._goals = dict.fromkeys(self._jaws, -self._config.close_rad)
 
+    def aim(self, opening_rad: float) -> None:
+        """Open or close so far, by the angle of each claw, within the range of `open` and `close`."""
+        wanted_rad = min(max(opening_rad, -self._config.close_rad), self._config.open_rad)
+        self._goals = dict.fromkeys(self._jaws, wanted_rad)
+
     def clamp(self, hand: ServoState) -> None:
         """Hold the object that has stopped the claws."""
         self._goals = {

@@ -16,7 +16,17 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
-from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Motion, Obstacles, ServoState
+from cocoro.messages import (
+    BaseState,
+    Detection,
+    Detections,
+    Intent,
+    Message,
+    Motion,
+    Obstacles,
+    PolicyActions,
+    ServoState,
+)
 from cocoro.messages.driving import HOLD_S
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
@@ -73,6 +83,8 @@ class StateEstimator:
         self.arm: ServoState | None = None
         self.hand: ServoState | None = None
         self.intent: Intent | None = None
+        self.proposed: PolicyActions | None = None
+        """The newest chunk of a learned policy."""
         self.unlocalised: dict[str, tuple[int, str]] = {}
         """By label, the stamp and note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
@@ -137,6 +149,8 @@ class StateEstimator:
             self._floors.append(message)
         elif isinstance(message, Intent):
             self.intent = message
+        elif isinstance(message, PolicyActions):
+            self.proposed = message
 
     def _keep_posture(self, network: str, state: ServoState) -> None:
         joints, history = self._postures.get(network, ((), None))

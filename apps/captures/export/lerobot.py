@@ -16,13 +16,13 @@ from apps.captures.export.lerobot_episodes import (
     RecordedTask,
     Recording,
     camera_rate_hz,
-    names_of,
     recorded_tasks,
 )
 from apps.captures.export.lerobot_files import Dataset, Shape, libraries
 from apps.captures.export.story import robot_of
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.tables import Tables
+from cocoro.features import names_of
 from cocoro.robot import Robot
 
 

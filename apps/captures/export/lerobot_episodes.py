@@ -18,23 +18,18 @@ from cocoro.capture.columns import Columns, MissingColumnError
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.tables import Tables
 from cocoro.clock import NS
+from cocoro.features import JOINT_STATES, picture_of, rows_of
 from cocoro.robot import Robot
 from cocoro.topics import (
     ARM_COMMAND,
-    ARM_STATE,
     BASE_COMMAND,
     BASE_STATE,
     FRAME,
     HAND_COMMAND,
-    HAND_STATE,
     TASK,
 )
 
-STATES, COMMANDS = (ARM_STATE, HAND_STATE), (ARM_COMMAND, HAND_COMMAND)
-BASE_NAMES = ("x.vel", "theta.vel")
-"""Speed ahead, m/s, and turn rate, rad/s, counter-clockwise; the names of LeRobot's own mobile robot."""
-ASIDE_NAME = "y.vel"
-"""Speed to the left, m/s, between the two, of a base that can move aside."""
+COMMANDS = (ARM_COMMAND, HAND_COMMAND)
 LONGEST_GAP_NS = round(FRAME.max_age_s * NS)
 """A task whose pictures or states have a longer gap is no episode: nothing in the robot acts on an older picture."""
 
@@ -76,13 +71,6 @@ class Episode(NamedTuple):
         return len(self.pictures_ns)
 
 
-def names_of(robot: Robot) -> list[str]:
-    """Names of the values of state and action."""
-    ahead, turn = BASE_NAMES
-    aside = [ASIDE_NAME] if robot.drive.goes_aside else []
-    return [*(f"{joint}.pos" for joint in robot.joints), ahead, *aside, turn]
-
-
 def recorded_tasks(capture: Tables) -> list[RecordedTask]:
     """The tasks in the order of their beginnings."""
     found: dict[str, RecordedTask] = {}
@@ -113,13 +101,13 @@ class Recording:
 
     def __init__(self, capture: Tables, robot: Robot) -> None:
         """Raises NotAnEpisodeError when the robot's state or all pictures are missing."""
-        wanted = [topic.name for topic in (*STATES, *COMMANDS, BASE_STATE, BASE_COMMAND, TASK)]
+        wanted = [topic.name for topic in (*JOINT_STATES, *COMMANDS, BASE_STATE, BASE_COMMAND, TASK)]
         capture.load(*(name for name in wanted if name in capture))
         self._capture = capture
         self._pictures_ns = _picture_stamps(capture)
         if not len(self._pictures_ns):
             raise NotAnEpisodeError("it has no pictures")
-        self._positions = _by_joint(capture, [topic.name for topic in STATES], "position_rad")
+        self._positions = _by_joint(capture, [topic.name for topic in JOINT_STATES], "position_rad")
         for joint in robot.joints:
             if joint not in self._positions:
                 raise NotAnEpisodeError(f"it has no state of the joint {joint}")
@@ -164,7 +152,7 @@ class Recording:
                     raise NotAnEpisodeError("its first picture cannot be read")
                 yield held
                 row += 1
-            held = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
+            held = picture_of(frame)
         for _ in range(row, episode.rows):
             if held is None:
                 raise NotAnEpisodeError("its pictures cannot be read")
@@ -175,7 +163,7 @@ class Recording:
 
     def _state(self, times_ns: IntArray) -> Float32Array:
         angles = [self._positions[joint].held(times_ns) for joint in self._joints]
-        return np.column_stack([*angles, self._odometry.held(times_ns)]).astype(np.float32)
+        return rows_of(angles, self._odometry.held(times_ns))
 
     def _action(self, times_ns: IntArray, state: Float32Array) -> Float32Array:
         """Goals in force. A joint without a goal, or whose command holds it, has its position as goal. The base's speed

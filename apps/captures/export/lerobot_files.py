@@ -20,11 +20,10 @@ from apps.captures.export.lerobot_episodes import Episode
 from apps.captures.export.lerobot_stats import SAMPLED_PICTURES, PictureStats, Stats, of_values
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
-from cocoro.topics import FRAME
+from cocoro.features import ACTION, PICTURES, STATE
 
 VERSION = "v3.0"
-PICTURES = f"observation.images.{FRAME.service}"
-STATE, ACTION, DONE, SUCCESS = "observation.state", "action", "next.done", "next.success"
+DONE, SUCCESS = "next.done", "next.success"
 COUNTED = ("frame_index", "episode_index", "index", "task_index")
 FILES_IN_CHUNK = 1000
 DATA_MB, VIDEO_MB = 100, 200

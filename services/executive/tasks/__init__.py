@@ -10,11 +10,12 @@ from services.executive.tasks.fetch import FetchTask
 from services.executive.tasks.follow import FollowTask
 from services.executive.tasks.go_there import GoThereTask
 from services.executive.tasks.go_to import GoToTask
+from services.executive.tasks.policy import PolicyTask
 from services.executive.tasks.touch import TouchTask
 
 TASKS = registry(
-    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, DriveTask, BabbleArmTask,
-     BabbleWheelsTask)
+    (FetchTask, FollowTask, TouchTask, GoToTask, GoThereTask, ParkTask, PutDownTask, DriveTask, PolicyTask,
+     BabbleArmTask, BabbleWheelsTask)
 )  # fmt: skip
 """All tasks by name, third parties' included."""
 
@@ -28,6 +29,7 @@ __all__ = [
     "GoThereTask",
     "GoToTask",
     "ParkTask",
+    "PolicyTask",
     "PutDownTask",
     "Task",
     "TouchTask",

@@ -17,6 +17,7 @@ from services.planning.behaviours.going import Going
 from services.planning.behaviours.going_there import GoingThere
 from services.planning.behaviours.handling import Closing, Lifting, PuttingDown, Reaching
 from services.planning.behaviours.looking import Exploring, Idling, Parking, Searching
+from services.planning.behaviours.policy import FollowingPolicy
 from services.planning.behaviours.touching import Touching
 
 __all__ = ["BEHAVIOURS", "Actuators", "Behaviour", "Idling", "Plan", "Snapshot", "behaviour_for"]
@@ -37,6 +38,7 @@ BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
     actions.GoTo: Going,
     actions.Drive: DrivingByHand,
     actions.GoThere: GoingThere,
+    actions.FollowPolicy: FollowingPolicy,
     actions.BabbleArm: ArmBabbling,
     actions.BabbleWheels: WheelBabbling,
 }

@@ -128,13 +128,14 @@ export class Tasks {
   }
 
   #button(task) {
-    const begin = () => this.run({ task: task.name, ...(task.label ? { label: this.chosen } : {}) });
+    const options = task.options.filter((option) => !PLACE.includes(option.name));
+    const open = () => this.#open(task, options);
+    const run = () => this.run({ task: task.name, ...(task.label ? { label: this.chosen } : {}) });
+    const begin = options.some((option) => option.needed) ? open : run;
     const main = task.name === MAIN && task.label;
     const name = make("span", {}, main ? title({ task: task.name, label: this.chosen }) : called("task", task.name));
     const button = make("button", { type: "button", class: `task${main ? " first" : ""}`, onclick: begin }, name);
-    const options = task.options.filter((option) => !PLACE.includes(option.name));
     if (options.length === 0) return button;
-    const open = () => this.#open(task, options);
     const label = say("task.options", { task: called("task", task.name) });
     return make("div", { class: "pair" }, button, make("button", { type: "button", class: `task${main ? " first" : ""}`, "aria-label": label, onclick: open }, "⋯"));
   }

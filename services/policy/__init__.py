@@ -1,0 +1,1 @@
+"""Runs learned policies: observes, has a policy act, and proposes its actions to the planner."""
