@@ -13,12 +13,13 @@ import onnx_file
 import policy_rig
 import pytest
 from capture_rig import STILL, frame
+from omni_robot import omni_robot
 from policy_rig import CHUNK, LISTED, RATE_HZ
 from spelled import action
 
 from cocoro import topics
 from cocoro.clock import RealClock
-from cocoro.features import PolicyFeatures, names_of
+from cocoro.features import STATE, PolicyFeatures, names_of
 from cocoro.joints import GROUPS
 from cocoro.messages import AboutRequest, BaseState, Intent, PolicyActions, ServoState
 from cocoro.policy import Observation, PolicyError
@@ -26,7 +27,9 @@ from cocoro.robot import Robot
 from cocoro.testing import ServiceUnderTest, in_virtual_time, misdeclared
 from services.policy.component import POLICY
 from services.policy.config import PolicyServiceConfig
+from services.policy.observing import Observer
 from services.policy.onnx import OnnxPolicy
+from services.policy.proposing import proposal
 
 ROBOT = Robot.load()
 WIDTH, HEIGHT = 16, 12
@@ -221,3 +224,27 @@ def test_features_that_differ_are_named() -> None:
     lacking = PolicyFeatures(state=names[2:], action=names, rate_hz=10.0)
     assert lacking.differs(ROBOT).endswith(f"{names[0]}, {names[1]} are missing")
     assert PolicyFeatures(state=names, action=names, rate_hz=10.0).differs(ROBOT) == ""
+
+
+def test_a_base_that_can_move_aside_is_seen_and_wanted_to_move_aside() -> None:
+    robot = omni_robot()
+    names = tuple(names_of(robot))
+    features = PolicyFeatures(state=names, action=names, rate_hz=10.0)
+    observer, found = Observer(robot, features, 0.05), None
+    moving = {"speed_mps": 0.1, "aside_mps": 0.2, "turn_rate_radps": 0.3}
+    states: list[tuple[topics.Topic[Any], Any]] = [
+        (topics.BASE_STATE, BaseState(odometry_m=(0.0, 0.0), stamp_ns=10**9, **{**STILL, **moving}))
+    ]
+    for topic, group in ((topics.HAND_STATE, GROUPS[1]), (topics.ARM_STATE, GROUPS[0])):
+        joints = robot.group_joints(group)
+        still = (0.0,) * len(joints)
+        state = ServoState(joints=joints, position_rad=still, speed_radps=still, load=still, stamp_ns=10**9)
+        states.append((topic, state))
+    for topic, state in states:
+        found = observer.take(topic, state, 10**9)
+    assert found is not None
+    row = found.content[STATE].astype(float)
+    assert row[-3:].tolist() == pytest.approx([0.1, 0.2, 0.3])
+    row[-3:] = 0.4, 0.5, 0.6
+    made = proposal(row, found, features, robot, "task", 1)
+    assert (made.ahead_mps, made.aside_mps, made.turn_radps) == ((0.4,), (0.5,), (0.6,))
