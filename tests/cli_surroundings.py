@@ -60,6 +60,7 @@ ARGUMENTS: dict[str, str] = {
     "cockpit end": "{name}",
     "servos set-id": "1 2 --port {name}",
     "servos calibrate": "elbow",
+    "servos import": "{name}",
     "servos limits": "elbow",
     "kinect tilt": "5",
     "learn arm": "{name}.jsonl",

@@ -91,7 +91,7 @@ def _floor_plan(fields: Data, width: int, height: int) -> Data:
 
 
 def _policy_actions(fields: Data, rows: int, joints: int) -> Data:
-    base = {name: [(fields.get(name) or [0.5])[0]] * rows for name in ("ahead_mps", "turn_radps")}
+    base = {name: [(fields.get(name) or [0.5])[0]] * rows for name in ("ahead_mps", "turn_radps", "aside_mps")}
     names = [f"joint_{number}" for number in range(joints)]
     return fields | base | {"joints": names, "goal_rad": [[0.5] * joints] * rows, "period_s": 0.1}
 

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("apps", "deploy", "services", "sim", "cocoro")
 OF_THE_CHECKOUT = re.compile(r"\b(?:docs|deploy|bench|tests)/|\bREADME|\.md\b")
 """Files that an installation by pip lacks, or has at a place of its own."""
-WRITTEN = {"report.md"}
+WRITTEN = {"report.md", "WHAT-IS-MISSING.md"}
 """Files that the program itself writes."""
 
 

@@ -46,7 +46,7 @@ class Policies:
             except Exception as error:  # a third party's code
                 raise PolicyError(f"policy {name} cannot be loaded: {type(error).__name__}: {error}") from error
             if not isinstance(features, PolicyFeatures):
-                raise PolicyError(f"policy {name} does not declare its features (docs/policies.md)")
+                raise PolicyError(f"policy {name} does not declare its features: `features` is no PolicyFeatures")
             if reason := features.differs(self._robot):
                 raise PolicyError(f"policy {name}: {reason}")
             if silent := [joint.name for joint in self._robot.joints.values() if joint.group is None]:

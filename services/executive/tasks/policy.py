@@ -16,7 +16,7 @@ class PolicyTask(Task, frozen=True, kw_only=True, tag="policy"):
     hand = "any"
     services = ("policy",)
 
-    label: Annotated[str, Meta(description="A policy that the robot has: docs/policies.md.")]
+    label: Annotated[str, Meta(description="A policy of the profile, from its table service.policy.")]
     for_s: Annotated[float, Meta(gt=0, le=3600, description="Let it for so long, then stop.")] | None = None
 
     def limit_s(self, limits: Limits) -> float:
