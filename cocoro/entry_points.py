@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from cocoro.distributions import may_add_to
@@ -31,6 +35,21 @@ def lent(module: str, name: str) -> object:
     """A name of a module above this package, which lends it to `cocoro`: loaded by name, so that nothing here imports
     it."""
     return getattr(import_module(module), name)
+
+
+def third_partys(name: str) -> ModuleType:
+    """A module that a setting names: `package.module`, or a file that ends with .py. Raises FileNotFoundError where
+    there is no such file, and what the module's code raises."""
+    if not name.endswith(".py"):
+        return import_module(name)
+    path = Path(name)
+    spec = spec_from_file_location(f"cocoro_of_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FileNotFoundError(name)
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for their own
+    spec.loader.exec_module(module)
+    return module
 
 
 @cache

@@ -56,6 +56,7 @@ def test_a_joint_that_moves_neither_hand_nor_camera_is_in_no_group() -> None:
     data = one_line_data()
     turning = {**next(row for row in data["link"] if row["joint"]), "name": "rim", "joint": WHEELS[0], "parent": "body"}
     data["link"].append(turning)
+    data["solid"]["part"].append({**data["solid"]["part"][0], "name": "rim", "link": "rim", "mass_kg": 0.1})
     assert Robot.from_data(data).joints[WHEELS[0]].group is None
 
 

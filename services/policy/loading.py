@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cocoro.entry_points import added_to
+from cocoro.entry_points import added_to, third_partys
 from cocoro.errors import choice_of
 from cocoro.features import PolicyFeatures
 from cocoro.policy import GROUP, Policy, PolicyError
@@ -87,13 +84,7 @@ class Policies:
 
 
 def _module(name: str) -> ModuleType:
-    if not name.endswith(".py"):
-        return importlib.import_module(name)
-    path = Path(name)
-    spec = importlib.util.spec_from_file_location(f"cocoro_policy_{path.stem}", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise PolicyError(f"there is no file {name}")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for their own
-    spec.loader.exec_module(module)
-    return module
+    try:
+        return third_partys(name)
+    except FileNotFoundError as error:
+        raise PolicyError(f"there is no file {name}") from error
