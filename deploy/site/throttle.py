@@ -28,7 +28,7 @@ from cocoro.bus.router import Link
 
 PERIOD_S = 0.02
 """Between two looks at the links."""
-ALLOWED_BYTES_S = 10e6
+ALLOWED_BYTES_S = 3e6
 """More than a person's program has to say at any time: a hundred times his questions, commands and own topics."""
 SAVED_S, AGAIN_S, DEBT_S = 1.0, 0.25, 0.25
 """Allowance that a silent person saves; with which held links go on; and that is counted against him at the most, which
