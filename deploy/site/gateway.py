@@ -121,6 +121,7 @@ class Gateway:
                     await self._until_changed(marks, refused)
                 finally:
                     await router.close()
+                    self._throttle.follow(())  # lest its duplicates keep connections open
                 log.info("the site or the trust in this host's clock has changed: the router is opened anew")
 
     async def _begin(self) -> None:
