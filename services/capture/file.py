@@ -21,7 +21,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -36,6 +35,7 @@ from mcap.records import (
 from cocoro.about import versions
 from cocoro.capture import mcap
 from cocoro.capture.conventions import CHECKSUM, MAKER, PROFILE, TALLY, KeyTally, checksum, tally_names
+from services.capture.chunk_index import ChunkIndices
 from services.capture.packing import PackedMessage, Packer, message_head
 
 LIBRARY = f"{MAKER} {versions().get('cocoro-mesh', '')}".strip()
@@ -76,16 +76,16 @@ class CaptureFile:
         self._fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._attached: list[AttachmentIndex] = []
         self._chunk = _Chunk()
         self._pending: list[bytes] = []
         """Schemas and channels to write at the start of the next chunk."""
         try:
+            self._chunks = ChunkIndices(path.parent)
             self._write([mcap.MAGIC, packed(Header(profile, LIBRARY))])
         except OSError:
-            self.abandon()
+            os.close(self._fd)
             path.unlink()
             raise
 
@@ -201,10 +201,12 @@ class CaptureFile:
             self._write(self._pending)
             self._pending.clear()
         self._write(self._ending())
+        self._chunks.close()
         return self._fd
 
     def abandon(self) -> None:
         """Close the file as it is: readable, but without summary."""
+        self._chunks.close()
         os.close(self._fd)
 
     # --- writing ----------------------------------------------------------------------------------
@@ -219,42 +221,27 @@ class CaptureFile:
             at += len(entries[-1])
         offset = self.size_bytes
         self._write([head, packed, b"".join(entries)])
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=offset,
-                compression=chunk.compression,
-                compressed_size=len(packed),
-                message_end_time=chunk.end_ns,
-                message_index_length=at - offset - length,
-                message_index_offsets=offsets,
-                message_start_time=chunk.start_ns,
-                uncompressed_size=chunk.raw_bytes,
-            )
-        )
+        self._chunks.add(chunk, offset, length, offsets, at - offset - length)
         self.raw_bytes += chunk.raw_bytes
 
     def _ending(self) -> list[bytes]:
         end = packed(DataEnd(0))  # no checksum over all data: each chunk has its own
         start = self.size_bytes + len(end)
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self._schemas.values())),
-            (Opcode.CHANNEL, list(self._channels.values())),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attached),
-            (Opcode.METADATA_INDEX, self._metadata),
+        sections = [
+            (Opcode.SCHEMA, packed(*self._schemas.values())),
+            (Opcode.CHANNEL, packed(*self._channels.values())),
+            (Opcode.STATISTICS, packed(self._statistics())),
+            (Opcode.CHUNK_INDEX, self._chunks.all()),
+            (Opcode.ATTACHMENT_INDEX, packed(*self._attached)),
+            (Opcode.METADATA_INDEX, packed(*self._metadata)),
         ]
-        builder, offsets = RecordBuilder(), []
-        for op, records in groups:
-            before = builder.count
-            for record in records:
-                record.write(builder)
-            if records:
-                offsets.append(SummaryOffset(op, start + before, builder.count - before))
-        offsets_start = start + builder.count
-        summary = ended(builder) + packed(*offsets)
-        return [end, summary, footer(summary, start, offsets_start), mcap.MAGIC]
+        offsets, at = [], start
+        for op, section in sections:
+            if section:
+                offsets.append(SummaryOffset(op, at, len(section)))
+            at += len(section)
+        summary = b"".join([*(section for _, section in sections), packed(*offsets)])
+        return [end, summary, footer(summary, start, at), mcap.MAGIC]
 
     def _statistics(self) -> Statistics:
         busy = [tally for tally in self.tallies.values() if tally.messages]
@@ -264,7 +251,7 @@ class CaptureFile:
             channel_count=len(self._channels),
             attachment_count=len(self._attached),
             metadata_count=len(self._metadata),
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunks.count,
             message_start_time=min((tally.first_ns for tally in busy), default=0),
             message_end_time=max((tally.last_ns for tally in busy), default=0),
             channel_message_counts={id: tally.messages for id, tally in self.tallies.items()},
