@@ -13,7 +13,7 @@ class CockpitConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The address of this machine at which the page is served; the default is reached from this machine alone."""
     port: Annotated[int, Meta(ge=0, le=65535)] = 8770
     """Where it is taken, the next free one of the `PORTS` after it; 0: any free one."""
-    fps: Annotated[float, Meta(gt=0, le=60)] = 15.0
+    fps: Annotated[float, Meta(gt=0, le=60)] = 16.0
     """Pictures a second at most, for each viewer."""
     jpeg_quality: Annotated[int, Meta(ge=10, le=95)] = 75
     """Of the pictures for viewers whose network carries them; for others it is less."""
