@@ -216,6 +216,20 @@ def test_after_a_stop_the_arm_starts_from_where_it_is_found(planner: Planner) ->
     assert planner.angles["elbow"] == pytest.approx(-1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("asks", ["idle", "approach"])
+def test_when_the_servos_began_anew_the_arm_starts_from_where_it_is_found(planner: Planner, asks: str) -> None:
+    parked = dict(planner.angles)
+    planner.want("approach", "red_can")
+    planner.run(3.0)
+    planner.want(asks, "red_can")
+    assert abs(planner.angles[ROBOT.arm.azimuth] - parked[ROBOT.arm.azimuth]) > 1.0, "the arm is unfolded"
+    planner.incarnation = 2  # a simulator that was started anew, or a supply that came back
+    planner.angles |= parked
+    planner.tick()
+    moved = max(abs(planner.angles[name] - parked[name]) for name in (*ROBOT.arm.joints, ROBOT.arm.roll))
+    assert moved < 2.5 * TICK_S + 1e-6, "no further than a step of the arm from where it stands"
+
+
 @pytest.mark.parametrize("joint", ["neck_tilt", "claw_left", "elbow"])
 def test_a_state_that_lacks_a_joint_is_no_state(planner: Planner, joint: str) -> None:
     group = ROBOT.joints[joint].group

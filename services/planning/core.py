@@ -46,6 +46,7 @@ class PlanningCore:
         self._behaviour: Behaviour = Idling(Idle())
         self._ended: Plan | None = None
         self._last_ns: int | None = None
+        self._servo_restarts = 0
         self._missing_since_ns: int | None = None
         self._looks_to: tuple[float, float] | None = None
         """Goal of the neck, where there is one."""
@@ -95,6 +96,10 @@ class PlanningCore:
                 self.learned.take(bytes(sample.message.content))
                 self._use_learned()
             self._estimator.take(sample.topic, sample.message, now_ns)
+        if self._estimator.servo_restarts != self._servo_restarts:
+            # The arm may stand anywhere since: a goal from before would be a motion that nobody checked.
+            self._servo_restarts = self._estimator.servo_restarts
+            self.actuators.arm.resync()
         self._estimator.localise(now_ns)
         self.learned.step(self._estimator.sightings_of(self._config.marker), now_ns)
         dt_s = self._elapsed(now_ns)

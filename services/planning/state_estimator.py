@@ -159,6 +159,11 @@ class StateEstimator:
             self._postures[network] = state.joints, history
         history.add(state.stamp_ns, state.position_rad, state.incarnation)
 
+    @property
+    def servo_restarts(self) -> int:
+        """How often the service of arm or hand, or its clock, began anew."""
+        return sum(history.resets for _, history in self._postures.values())
+
     def posture(self, stamp_ns: int) -> dict[str, float]:
         """Every joint's angle, rad, at a time; the newest where that time is not in the history."""
         angles = dict(self.angles())
