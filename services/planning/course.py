@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import atan2, cos, hypot, pi, sin
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,12 @@ from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.escape import Escape
 from services.planning.floor_plan import Way
+from services.planning.footprint import ArmOut, Footprint
 from services.planning.gaze import gaze_of
 from services.planning.navigation import Driver, Offset, offset_to
+from services.planning.routes import Routes
 from services.planning.surroundings import Fields, Surroundings, placed
+from services.planning.unfolding import NOT_HERE, Unfolding
 
 _HEADINGS = 48
 _REPLAN_NS = NS // 2
@@ -54,6 +57,8 @@ class Detour(NamedTuple):
 
     before: Pose2
     path: tuple[tuple[float, float], ...]
+    stretch_m: float
+    """Length of the last stretch, which begins there."""
 
 
 class Course:
@@ -65,7 +70,7 @@ class Course:
         config: PlanningConfig,
         aim_m: tuple[float, float],
         *,
-        arm: Literal["last", "out", "folded"],
+        arm: ArmOut,
         arrive_m: float | None = None,
         swing_m: FloatArray | None = None,
         serves: Callable[[Pose2], bool] | None = None,
@@ -76,16 +81,14 @@ class Course:
         positions (n, 2), body frame, metres, that the arm sweeps while it unfolds; they must be free before the last
         stretch. `serves`: which poses before the target are good for what comes then; None: all.
         """
-        self._swing = swing_m
+        self._unfolding = Unfolding(config.navigation, swing_m)
         self._serves = serves or (lambda pose: True)
         self._config = config.navigation
         self._aim_m, self._arrive_m = aim_m, arrive_m
         self._arm_out = arm == "out"
         self._stretch_m = 0.0 if arm == "folded" else self._config.last_stretch_m
-        self._body_m = robot.base.chassis_diameter_m / 2
-        # Footprint of the hand with open claws along the arm's line in front of the robot.
-        reach = () if arm == "folded" else np.arange(0.22, aim_m[0] + 0.09, 0.04)
-        self._arm = np.array([[x, aim_m[1]] for x in reach]).reshape(-1, 2)
+        self._footprint = Footprint(robot, config.navigation, aim_m, arm)
+        self._body_m, self._arm = self._footprint.body_m, self._footprint.arm
         self._glance: tuple[tuple[float, float], int] | None = None
         self._folded = False
         self._detour: Detour | None = None
@@ -114,14 +117,18 @@ class Course:
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
-        if (near_enough or driver.arrived(offset)) and self._serves(body):
+        there = (near_enough or driver.arrived(offset)) and self._serves(body)
+        if there and self._roomy_here(body, fields):
             return Move(0.0, 0.0, abs(offset.ahead_m), "there", True, arrived=True)
+        elsewhere = not there or self._unfolding.leave()
         leaving = self._leave(abs(offset.ahead_m), body, fields, driver, now_ns)
         if leaving is not None:
             return leaving
         if self._planned_ns is None or now_ns - self._planned_ns >= _REPLAN_NS:
             self._planned_ns = now_ns
             self._plan(target_m, body, around, fields, driver, offset)
+        if there and (self._detour is None or not elsewhere):
+            return self._no_room(abs(offset.ahead_m), body, fields, now_ns)
         if self._detour is None:
             speed, turn = driver.law(offset)
             why = f"{offset.ahead_m:.2f} m to drive, {offset.heading_rad:+.2f} rad to turn"
@@ -147,10 +154,12 @@ class Course:
         preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
         # Hysteresis: on the last stretch, with the hand extended, smaller margins do.
         share = 0.5 if self._last_stretch else 1.0
-        free = self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields)
+        unfolds = not self._folded or self._unfolding.roomy_on(preview, fields)
+        free = self._footprint.free(preview, fields, share, arm_from_m=self._stretch_m) and unfolds
         if free and self._serves(preview[-1]):
             self._detour = None
             self._last_stretch, self.walled = True, False
+            self._unfolding.gone_on()
             return
         self._last_stretch = False
         if self._detour is not None and self._still_good(self._detour, fields, target_m):
@@ -158,35 +167,21 @@ class Course:
         self._detour = self._around(target_m, body, around, fields)
         self.walled = self._detour is None
 
-    def _free(self, poses: list[Pose2], fields: Fields, share: float, arm_from_m: float) -> bool:
-        """Whether body and (over the last `arm_from_m`) hand pass all poses with this share of their margins."""
-        centres = np.array([[pose.x_m, pose.y_m] for pose in poses])
-        clearance = fields.body.at(centres) - self._body_m
-        # The robot may always leave the place where it stands.
-        leaving = np.hypot(*(centres - centres[0]).T) < 0.10
-        if (clearance[~leaving] < share * self._config.clearance_m).any():
-            return False
-        end = centres[-1]
-        half_m = self._config.hand_half_width_m * (0.4 + 0.6 * share)
-        for pose in [*poses[::3], poses[-1]]:
-            near_end = hypot(pose.x_m - end[0], pose.y_m - end[1]) <= (0.02 if self._arm_out else arm_from_m)
-            if not self._arm_free(pose, fields, half_m, near_end=near_end):
-                return False
-        return True
-
-    def _unfolds_on(self, poses: list[Pose2], fields: Fields) -> bool:
-        """Whether a folded arm has room to unfold before it must be extended."""
-        if not self._folded or self._swing is None:
-            return True
-        end = poses[-1]
-        early = [p for p in poses if hypot(p.x_m - end.x_m, p.y_m - end.y_m) >= self._config.unfold_by_m] or poses[:1]
-        return any(self.roomy(pose, fields) for pose in early[:: max(len(early) // 6, 1)])
-
     def roomy(self, pose: Pose2, fields: Fields) -> bool:
         """Whether the arm can unfold at a pose without touching a known obstacle."""
-        if self._swing is None:
-            return True
-        return bool((fields.arm.at(placed(self._swing, pose)) > self._config.swing_room_m).all())
+        return self._unfolding.roomy(pose, fields)
+
+    def _roomy_here(self, body: Pose2, fields: Fields) -> bool:
+        return not self._folded or self._unfolding.roomy(body, fields)
+
+    def _no_room(self, left_m: float, body: Pose2, fields: Fields, now_ns: int) -> Move:
+        """At the target, where the arm has no room to unfold, and no way to where it has: the camera looks at what is
+        in the way, and then the robot gives up."""
+        place = self._unfolding.in_the_way(body, fields)
+        move = Move(0.0, 0.0, left_m, f"{NOT_HERE}: looking at what is in the way", False, look_at=place)
+        if place is None or not self._unfolding.given_up(now_ns):
+            return move
+        return move._replace(blocked=True, why=self._unfolding.why_not(body, place))
 
     def _around(
         self, target_m: tuple[float, float], body: Pose2, around: Surroundings, fields: Fields
@@ -195,6 +190,22 @@ class Course:
         config = self._config
         radius = self._body_m + config.clearance_m
         routes = around.routes(fields.body, body, radius, config.comfort_m)
+        for stretch_m, spare_m in self._unfolding.tries if self._stretch_m else ((0.0, 0.0),):
+            before = self._nearest_before(target_m, body, routes, fields, stretch_m, spare_m)
+            if before is not None:
+                return Detour(before, tuple(routes.path(before.x_m, before.y_m)), stretch_m)
+        return None
+
+    def _nearest_before(
+        self,
+        target_m: tuple[float, float],
+        body: Pose2,
+        routes: Routes,
+        fields: Fields,
+        stretch_m: float,
+        spare_m: float,
+    ) -> Pose2 | None:
+        """The cheapest pose so far before the target, with so much room to spare for the arm."""
         best: tuple[float, Pose2] | None = None
         for number in range(_HEADINGS):
             yaw = -pi + 2 * pi * number / _HEADINGS
@@ -204,43 +215,22 @@ class Course:
                 target_m[1] - s * self._aim_m[0] - c * self._aim_m[1],
                 yaw,
             )
-            back = np.linspace(self._stretch_m, 0.0, 8)
+            back = np.linspace(stretch_m, 0.0, 8)
             stretch = [Pose2(end.x_m - c * step, end.y_m - s * step, yaw) for step in back]
             cost = routes.cost(stretch[0].x_m, stretch[0].y_m)
-            if not np.isfinite(cost) or not self._free_stretch(stretch, fields):
+            if not np.isfinite(cost) or not self._footprint.free_stretch(stretch, fields):
                 continue
-            if not self.roomy(stretch[0], fields) or not self._serves(end):
+            if not self._unfolding.roomy(stretch[0], fields, spare_m) or not self._serves(end):
                 continue
             bearing = atan2(stretch[0].y_m - body.y_m, stretch[0].x_m - body.x_m)
             cost += 0.25 * abs(wrap_rad(yaw - bearing))
             if best is None or cost < best[0]:
                 best = (cost, stretch[0])
-        if best is None:
-            return None
-        path = routes.path(best[1].x_m, best[1].y_m)
-        return Detour(best[1], tuple(path))
-
-    def _free_stretch(self, stretch: list[Pose2], fields: Fields) -> bool:
-        centres = np.array([[pose.x_m, pose.y_m] for pose in stretch])
-        if (fields.body.at(centres) < self._body_m + self._config.clearance_m).any():
-            return False
-        half_m = self._config.hand_half_width_m + 0.01
-        last = len(stretch) - 1
-        return all(
-            self._arm_free(pose, fields, half_m, near_end=not self._arm_out or number == last)
-            for number, pose in enumerate(stretch)
-        )
-
-    def _arm_free(self, pose: Pose2, fields: Fields, half_m: float, *, near_end: bool) -> bool:
-        """Whether the hand passes a pose. Carried high it passes over known objects; near the end it is low."""
-        if not len(self._arm) or not (near_end or self._arm_out):
-            return True
-        field = fields.arm if self._arm_out and not near_end else fields.body
-        return not (field.at(placed(self._arm, pose)) < half_m).any()
+        return best[1] if best is not None else None
 
     def _still_good(self, detour: Detour, fields: Fields, target_m: tuple[float, float]) -> bool:
         """Whether the path is still free and still ends in front of the target."""
-        end = detour.before.compose(Pose2(self._stretch_m))
+        end = detour.before.compose(Pose2(detour.stretch_m))
         aim = end.apply((*self._aim_m, 0.0))
         if hypot(aim[0] - target_m[0], aim[1] - target_m[1]) > 0.06:
             return False
@@ -261,6 +251,7 @@ class Course:
             if abs(turn) < 0.08:
                 # The last stretch begins here, whatever the next plan finds.
                 self._detour, self._last_stretch = None, True
+                self._unfolding.gone_on()
             return Move(0.0, 1.8 * turn, left_m, f"{turn:+.2f} rad to turn before the last stretch", False), rest
         point, round_corner = self._ahead(rest, detour, body, fields)
         heading = wrap_rad(atan2(point[1] - body.y_m, point[0] - body.x_m) - body.yaw_rad)
@@ -312,7 +303,7 @@ class Course:
             self._planned_ns = min(self._planned_ns, now_ns - _REPLAN_NS // 2)
         held = careful.speed_mps == 0.0 and move.speed_mps != 0.0 and abs(careful.turn_radps) < _WAITING_RADPS
         self._escape.held(
-            held, body, fields.body, around.unseen, lambda turn: self._may_turn(turn, body, fields), now_ns
+            held, body, fields.body, around.unseen, lambda turn: self._footprint.may_turn(turn, body, fields), now_ns
         )  # fmt: skip
         move = careful
         waiting = move.speed_mps == 0.0 and abs(move.turn_radps) < _WAITING_RADPS
@@ -384,16 +375,6 @@ class Course:
             return None
         self._stuck_since_ns = None
         return move
-
-    def _may_turn(self, turn_rad: float, body: Pose2, fields: Fields) -> bool:
-        """Whether the extended arm meets nothing while the robot turns on the spot; the body is round."""
-        if not self._arm_out or not len(self._arm):
-            return True
-        now_m = float(fields.arm.at(placed(self._arm, body)).min())
-        turns = np.linspace(0.0, turn_rad, max(2, round(abs(turn_rad) / 0.1)))
-        poses = [Pose2(body.x_m, body.y_m, body.yaw_rad + float(turned)) for turned in turns]
-        least_m = min(float(fields.arm.at(placed(self._arm, pose)).min()) for pose in poses)
-        return least_m >= min(self._config.hand_half_width_m * 0.7, now_m)
 
     @staticmethod
     def _clearance_m(body: Pose2, fields: Fields) -> float:

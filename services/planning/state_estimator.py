@@ -39,6 +39,7 @@ from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
 from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
+from services.planning.posture_history import PostureHistory
 from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
 from services.planning.surroundings import OBJECT_M, Surroundings
@@ -50,8 +51,9 @@ _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
 _STEADY_RADPS = 1.0
 """A camera that turns faster does not correct the body's pose."""
-_POSTURES = 256
-"""States of a network that are kept: 5 s, so that a slow perception's frames find theirs."""
+_ARM_M = 0.75
+"""As far from the body's centre an arm reaches. So near nothing that is seen counts while it is not known where the arm
+was: it would stay on the map as an obstacle in its own way."""
 _GLIMPSE_NS = NS // 20
 """Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
@@ -88,7 +90,7 @@ class StateEstimator:
         self.unlocalised: dict[str, tuple[int, str]] = {}
         """By label, the stamp and note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
-        self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
+        self._postures = PostureHistory(round(config.odometry_gap_s * NS))
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
         self._gaze = gaze_of(robot, config.head)
@@ -133,7 +135,7 @@ class StateEstimator:
             elif before is not None and newest is not None:
                 self.matching.moved(Pose2(*before[1].tolist()), Pose2(*newest[1].tolist()))
         elif isinstance(message, ServoState):
-            self._keep_posture(topic.name, message)
+            self._postures.add(topic.name, message)
             if topic.name == topics.ARM_STATE.name:
                 self.arm = message
             else:
@@ -152,26 +154,10 @@ class StateEstimator:
         elif isinstance(message, PolicyActions):
             self.proposed = message
 
-    def _keep_posture(self, network: str, state: ServoState) -> None:
-        joints, history = self._postures.get(network, ((), None))
-        if history is None or joints != state.joints:
-            history = History(len(state.joints), capacity=_POSTURES)
-            self._postures[network] = state.joints, history
-        history.add(state.stamp_ns, state.position_rad, state.incarnation)
-
     @property
     def servo_restarts(self) -> int:
         """How often the service of arm or hand, or its clock, began anew."""
-        return sum(history.resets for _, history in self._postures.values())
-
-    def posture(self, stamp_ns: int) -> dict[str, float]:
-        """Every joint's angle, rad, at a time; the newest where that time is not in the history."""
-        angles = dict(self.angles())
-        for joints, history in self._postures.values():
-            then = history.at(stamp_ns, self._gap_ns)
-            if then is not None:
-                angles.update(zip(joints, then.tolist(), strict=True))
-        return angles
+        return self._postures.restarts
 
     def localise(self, now_ns: int) -> None:
         """Enter detections whose odometry is known into the memory; others wait for 0.2 s."""
@@ -201,10 +187,12 @@ class StateEstimator:
             self._floors.popleft()
             if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
                 seen = self._standing(seen)
-                angles = self.posture(seen.stamp_ns)
+                angles = dict(self.angles()) | self._postures.near(seen.stamp_ns)
                 view = DepthView(self._robot, seen.nearest, angles) if len(seen.nearest) == VIEW_BYTES else None
                 known = self._solids(seen.stamp_ns)
                 hull, odometry = own(angles), Pose2(*pose.tolist())
+                if not self._postures.known(seen.stamp_ns):  # what is near may be the robot's own arm
+                    hull = np.vstack([hull[0], np.zeros(3)]), np.append(hull[1], _ARM_M)
                 turning_radps = self._turning_radps(seen.stamp_ns)
                 correct = self.seen.running or (on_way and self.matching.shift is not None)
                 if correct and turning_radps < _STEADY_RADPS:
@@ -233,7 +221,7 @@ class StateEstimator:
     def _turning_radps(self, stamp_ns: int) -> float:
         """The rate at which the camera turned before a time; infinite where that is not known."""
         before_ns = stamp_ns - _GLIMPSE_NS
-        angles, before = self._posture_at(stamp_ns), self._posture_at(before_ns)
+        angles, before = self._postures.at(stamp_ns), self._postures.at(before_ns)
         pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
         if angles is None or before is None or pose is None or pose_before is None:
             return inf
@@ -282,7 +270,7 @@ class StateEstimator:
         self._in_frames.append((detections.stamp_ns, tuple(solids)))
 
     def _keep_sighting(self, detection: Detection, stamp_ns: int) -> None:
-        angles = self._posture_at(stamp_ns)
+        angles = self._postures.at(stamp_ns)
         if angles is not None and detection.position_m is not None:
             self._sightings.append(
                 PostureSighting(detection.label, stamp_ns, detection.position_m, detection.area_px, angles)
@@ -300,16 +288,6 @@ class StateEstimator:
     def sightings_of(self, label: str) -> list[PostureSighting]:
         """The watched label's sightings of the current step, in order."""
         return [sighting for sighting in self._sightings if sighting.label == label]
-
-    def _posture_at(self, stamp_ns: int) -> dict[str, float] | None:
-        """Every joint's angle, rad, at a time; None where that time is not in the history."""
-        angles: dict[str, float] = {}
-        for joints, history in self._postures.values():
-            then = history.at(stamp_ns, self._gap_ns)
-            if then is None:
-                return None
-            angles.update(zip(joints, then.tolist(), strict=True))
-        return angles
 
     def body(self) -> Pose2 | None:
         """The body's newest pose in the odometry frame."""

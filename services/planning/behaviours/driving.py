@@ -199,8 +199,6 @@ class Approaching:
             return arm.park(angles, dt_s), move
         elif not self._room_here(snapshot, fields):
             step = arm.park(angles, dt_s)._replace(arrived=False)
-            if move.arrived:
-                return step, move._replace(arrived=False, blocked=True, why="no room to unfold the arm")
             return step, move._replace(why=f"no room yet to unfold the arm; {move.why}")
         elif arm.parked(reference) and (place := self._unseen_swing(snapshot)) is not None:
             why = "looking where to unfold the arm"
