@@ -45,6 +45,8 @@ def measure(chosen: Namespace, report: Report) -> None:
     memory = json.loads((RECORD / "memory.json").read_text())
     report.value("memory of all their processes, at its peak", [memory["peak_mb"]], "MB", at_most=MEMORY_MB)
     report.value("processor time of the tests and of what they waited for", [_sum(files, "processor_s")], "s")
+    if idle_s := memory.get("idle_s"):
+        report.value("processor time that nobody used", [idle_s[-1] - idle_s[0]], "s")
     report.value("tests", [_sum(files, "tests")], "")
     longest = sorted(files.items(), key=lambda one: -one[1]["wall_s"])
     others = dict(longest[SHOWN:])
@@ -58,22 +60,33 @@ def measure(chosen: Namespace, report: Report) -> None:
     largest = [[name, test, f"{size:.0f}"] for name, size, test in memory["largest"]]
     peak = f"processes at the peak, after {memory['at_s']:.0f} s"
     report.tables.append(Table(peak, ["process", "for the test", "MB"], largest))
-    report.tables.append(Table("memory over time", ["from, s", "MB", "most of it for"], _over_time(memory["looks"])))
+    head = ["from, s", "MB", "cores idle", "most of it for"]
+    report.tables.append(Table("memory over time", head, _over_time(memory["looks"], memory.get("idle_s", []))))
 
 
-def _over_time(looks: list[tuple[float, float, dict[str, float]]]) -> list[list[str]]:
-    """The look with the largest sum of each `SLICE_S`, and for which files of tests the memory was."""
+def _over_time(looks: list[tuple[float, float, dict[str, float]]], idle_s: list[float]) -> list[list[str]]:
+    """The look with the largest sum of each `SLICE_S`, for which files of tests the memory was, and how many cores were
+    idle in the mean until the next slice."""
     highest: dict[int, tuple[float, float, dict[str, float]]] = {}
-    for look in looks:
+    first: dict[int, int] = {}
+    for number, look in enumerate(looks):
         part = int(look[0] // SLICE_S)
+        first.setdefault(part, number)
         if part not in highest or highest[part][1] < look[1]:
             highest[part] = look
+    ends = [*first.values(), len(looks) - 1][1:]
     rows = []
-    for part, (_, total_mb, parts) in sorted(highest.items()):
+    for (part, (_, total_mb, parts)), end in zip(highest.items(), ends, strict=True):
         largest = sorted(parts.items(), key=lambda one: -one[1])[:NAMED]
         words = ", ".join(f"{Path(name.partition(' -')[0]).name} {size:.0f}" for name, size in largest)
-        rows.append([f"{part * SLICE_S:.0f}", f"{total_mb:.0f}", words])
+        rows.append([f"{part * SLICE_S:.0f}", f"{total_mb:.0f}", _idle(looks, idle_s, first[part], end), words])
     return rows
+
+
+def _idle(looks: list[tuple[float, float, dict[str, float]]], idle_s: list[float], begin: int, end: int) -> str:
+    """Idle cores between two looks; nothing where the record does not say."""
+    seconds = looks[end][0] - looks[begin][0]
+    return f"{(idle_s[end] - idle_s[begin]) / seconds:.1f}" if idle_s and seconds > 0 else ""
 
 
 def _sum(files: dict[str, dict[str, float]], name: str) -> float:

@@ -10,6 +10,7 @@ import asyncio
 import heapq
 import math
 import selectors
+from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
@@ -57,6 +58,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     """`time()` starts at 0."""
 
     _scheduled: list[asyncio.TimerHandle]
+    _ready: deque[asyncio.Handle]
     _check_closed: Callable[[], None]
 
     def __init__(self) -> None:
@@ -69,6 +71,11 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     def time(self) -> float:
         return self._virtual_s
+
+    @property
+    def due(self) -> bool:
+        """Whether anything is left to run before time moves."""
+        return bool(self._ready) or bool(self._scheduled and self._scheduled[0].when() <= self._virtual_s)
 
     def advance(self) -> None:
         """Moves time to the next timer's deadline."""

@@ -8,6 +8,8 @@ does not depend on the number of frames before it. Motion blur is the exception:
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +45,27 @@ EXPOSURE_DRIFT = 0.10
 WHITE_BALANCE_DRIFT = 0.05
 DRIFT_S = 5.0
 """Time from one extreme to the other."""
+
+
+class _Errors(NamedTuple):
+    """What is drawn once for a sensor, from the run's seed; none of it changes."""
+
+    colour_noise: ByteNoise
+    depth_noise: DepthNoise
+    exposure: Drift
+    white_balance: Drift
+
+
+@lru_cache(maxsize=3)
+def _errors(seed: int, width: int, height: int) -> _Errors:
+    """Kept for the next sensor with this seed and size, since to draw a million numbers takes as long as ten frames."""
+    rng = stream(seed, "kinect")
+    return _Errors(
+        ByteNoise(rng, width * height, COLOUR_SIGMA),
+        DepthNoise(rng, (height, width), DEPTH_SIGMA_PER_M),
+        Drift(rng, EXPOSURE_DRIFT, DRIFT_S),
+        Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S),
+    )
 
 
 class SimKinect:
@@ -83,11 +106,7 @@ class SimKinect:
         self._before: tuple[int, FloatArray] | None = None
         keep_freed_memory()
         if self._real:
-            rng = stream(seed, "kinect")
-            self._colour_noise = ByteNoise(rng, width * height, COLOUR_SIGMA)
-            self._depth_noise = DepthNoise(rng, (height, width), DEPTH_SIGMA_PER_M)
-            self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
-            self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
+            self._errors = _errors(seed, width, height)
 
     def __enter__(self) -> SimKinect:
         return self
@@ -145,14 +164,14 @@ class SimKinect:
                 motion = motion_between(self._before[1], camera_pose, EXPOSURE_S / gap_s)
                 colour = blur_along_motion(colour, motion, depth_m, self._renderer.camera)
         time_s = stamp_ns / 1e9
-        exposure, balance = 1 + self._exposure.at(time_s), self._white_balance.at(time_s)
+        exposure, balance = 1 + self._errors.exposure.at(time_s), self._errors.white_balance.at(time_s)
         gains = np.array([exposure * (1 + balance), exposure, exposure * (1 - balance)])
-        return self._colour_noise.add(scale_channels(colour, gains), rng)
+        return self._errors.colour_noise.add(scale_channels(colour, gains), rng)
 
     def _measure(self, depth_m: Float32Array, rng: np.random.Generator) -> CodeArray:
         """Convert depth (height, width), m, to the depth camera's codes: noise is added before quantising; there is no
         data out of range, in the projector's shadow (negative metres) and for some pixels on edges."""
-        return drop_edges(self._coder.codes(self._depth_noise.add(depth_m, rng)), rng)
+        return drop_edges(self._coder.codes(self._errors.depth_noise.add(depth_m, rng)), rng)
 
 
 def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:

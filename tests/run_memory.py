@@ -2,12 +2,12 @@
 
 They are those whose environment names the folder (`COCORO_TESTS_RECORD`). Memory that several processes share is
 counted in parts (proportional set size, proc_pid_smaps(5)), so that the sum has each page once. `memory.json` in the
-folder gets the largest processes of the look with the largest sum, of every look the sum and its parts by the file of
-tests for which a process runs, and for every test the most that was there while it ran: what its worker does not share
-with other workers, and all processes that tests of this worker have started, also earlier ones of its file, whose
-fixtures go on. A worker writes which test it runs (`running-PID`, `tests/run_record.py`), and what a test starts
-inherits the variables `PYTEST_CURRENT_TEST` and `COCORO_TESTS_WORKER`, the number of the worker. What begins and ends
-between two looks is not seen.
+folder gets the largest processes of the look with the largest sum, of every look the sum, its parts by the file of
+tests for which a process runs and the processor time that nobody has used until then, and for every test the most that
+was there while it ran: what its worker does not share with other workers, and all processes that tests of this worker
+have started, also earlier ones of its file, whose fixtures go on. A worker writes which test it runs (`running-PID`,
+`tests/run_record.py`), and what a test starts inherits the variables `PYTEST_CURRENT_TEST` and `COCORO_TESTS_WORKER`,
+the number of the worker. What begins and ends between two looks is not seen.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ RUNNING = "running-"
 WORKER = "COCORO_TESTS_WORKER"
 """Environment variable of what tests start: the number of the worker that runs them."""
 _PAGE = resource.getpagesize()
+_TICKS_HZ = os.sysconf("SC_CLK_TCK")
 _FIELD = re.compile(rb"^(Pss|Private_Clean|Private_Dirty):\s+(\d+) kB", re.MULTILINE)
 _TEST = re.compile(rb"(?:^|\0)PYTEST_CURRENT_TEST=([^\0]+) \(\w+\)")
 _WORKER = re.compile(rb"(?:^|\0)" + WORKER.encode() + rb"=(\d+)")
@@ -106,13 +107,15 @@ class Watch:
         self.peak_mb, self.at_s = 0.0, 0.0
         self.looks: list[tuple[float, float, dict[str, float]]] = []
         """Time in s, sum in MB, and its parts by the file of tests."""
+        self.idle_s: list[float] = []
+        """For each look the processor time that nobody has used since the begin, s, of all cores."""
         self.largest: list[tuple[str, float, str]] = []
         self.own_mb: dict[str, float] = defaultdict(float)
         """By test."""
         if (before := folder.parent / LAST / MEMORY).is_file():
             needed_mb = json.loads(before.read_text()).get("own_mb", {})
             self.own_mb |= {test: round(KEPT * mb, 1) for test, mb in needed_mb.items() if KEPT * mb > LEAST_MB}
-        self._begun_s = time.monotonic()
+        self._begun_s, self._idle_before_s = time.monotonic(), _idle_s()
 
     def look(self) -> None:
         """Sum the memory of all that run now."""
@@ -134,6 +137,7 @@ class Watch:
         for test, size_mb in own_mb.items():
             self.own_mb[test] = max(self.own_mb[test], round(size_mb, 1))
         self.looks.append((round(at_s, 1), round(total_mb, 1), parts))
+        self.idle_s.append(round(_idle_s() - self._idle_before_s, 2))
         if total_mb > self.peak_mb:
             self.peak_mb, self.at_s = total_mb, at_s
             largest = sorted(found, key=lambda one: -one.memory.part)[:SHOWN]
@@ -209,6 +213,12 @@ def _read(process: str, file: str) -> bytes:
         return opened.readall()
 
 
+def _idle_s() -> float:
+    """Processor time that nobody has used since the system's start, s, of all cores; with the waits for disks."""
+    idle, waits = Path("/proc/stat").read_bytes().split(maxsplit=6)[4:6]
+    return (int(idle) + int(waits)) / _TICKS_HZ
+
+
 def _title(process: str) -> str:
     words = _read(process, "cmdline").decode(errors="replace").split("\0")
     return " ".join(Path(word).name if "/" in word else word for word in words)[:60].strip()
@@ -223,8 +233,8 @@ def main() -> None:
             watch.look()
             time.sleep(LOOK_S)
     finally:
-        written = {"peak_mb": watch.peak_mb, "at_s": watch.at_s, "largest": watch.largest, "looks": watch.looks}
-        folder.joinpath(MEMORY).write_text(json.dumps(written | {"own_mb": watch.own_mb}))
+        names = ("peak_mb", "at_s", "largest", "looks", "idle_s", "own_mb")
+        folder.joinpath(MEMORY).write_text(json.dumps({name: getattr(watch, name) for name in names}))
 
 
 if __name__ == "__main__":

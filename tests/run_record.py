@@ -2,8 +2,8 @@
 
 A pytest plugin. It does nothing unless `COCORO_TESTS_RECORD` names a folder; `deploy/test.sh` does that. Each run of
 pytest writes a file there: for each file of tests its wall time, its processor time (with that of the processes that it
-waited for) and the memory of pytest itself. The files that took longest in the last run come first, so that no worker
-is left with a long one at the end. `python -m bench tests` shows the record.
+waited for) and the memory of pytest itself, and for each test its wall time. The files that took longest in the last
+run come first, so that no worker is left with a long one at the end. `python -m bench tests` shows the record.
 """
 
 from __future__ import annotations
@@ -17,17 +17,11 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from run_known import file_of, kept, recorded
 from run_memory import LAST, RUNNING, WORKER
 
 FOLDER = "COCORO_TESTS_RECORD"
 """Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
-LONG = (
-    "faults_live", "stop_live", "readme", "site_intruders", "faults_mend", "cli_surroundings", "cockpit_page",
-    "faults_speed", "robot_faults", "faults_barrage", "wire_faults", "faults_message", "client_live", "cockpit_browser",
-    "faults_silence", "site_hosts", "wire_robot", "capture_mesh", "cockpit_page_driving", "faults_full", "live",
-    "faults_two_robots", "faults_asleep", "rehearse", "bus_leaving",
-)  # fmt: skip
-"""Files that take long, the longest first; for a run without a record."""
 FIGURES = ("tests", "wall_s", "processor_s", "memory_mb")
 
 
@@ -42,17 +36,6 @@ def memory_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
-def wall_s_of(folder: Path) -> dict[str, float]:
-    """Wall time of each file of tests in a record; without one `LONG` gives the order alone."""
-    found: dict[str, float] = defaultdict(float)
-    if not folder.is_dir():
-        return {f"tests/test_{name}.py": float(len(LONG) - place) for place, name in enumerate(LONG)}
-    for part in folder.glob("pytest-*.json"):
-        for file, figures in json.loads(part.read_text())["files"].items():
-            found[file] = max(found[file], figures["wall_s"])
-    return found
-
-
 class Record:
     """With `--spread` the workers measure, and their reports carry it to the process that writes."""
 
@@ -63,6 +46,7 @@ class Record:
         self._begun_s = time.monotonic()
         self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+        self._tests_s: dict[str, float] = defaultdict(float)
         os.environ[WORKER] = str(os.getpid())
 
     @property
@@ -77,8 +61,8 @@ class Record:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        took_s = wall_s_of(self.last)
-        items.sort(key=lambda item: -took_s.get(_file(item.nodeid), 0.0))  # of a file, and of equals, the order stays
+        took_s = (recorded(self.last) or kept()).wall_s
+        items.sort(key=lambda item: -took_s.get(file_of(item.nodeid), 0.0))  # of a file, and of equals, the order stays
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """For `tests/run_memory.py`, which looks from outside."""
@@ -93,7 +77,8 @@ class Record:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         figures: dict[str, float] = report.__dict__.get("figures", {"processor_s": 0.0, "memory_mb": 0.0})
-        file = self._files[_file(report.nodeid)]
+        file = self._files[file_of(report.nodeid)]
+        self._tests_s[report.nodeid] += report.duration
         file["tests"] += report.when == "call"
         file["wall_s"] += report.duration
         file["processor_s"] += figures["processor_s"]
@@ -104,12 +89,9 @@ class Record:
             "arguments": list(self._config.invocation_params.args),
             "wall_s": time.monotonic() - self._begun_s,
             "files": self._files,
+            "tests_s": {test: round(took_s, 3) for test, took_s in self._tests_s.items()},
         }
         (self._folder / f"pytest-{os.getpid()}.json").write_text(json.dumps(written))
-
-
-def _file(nodeid: str) -> str:
-    return nodeid.partition("::")[0]
 
 
 def pytest_configure(config: pytest.Config) -> None:

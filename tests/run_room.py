@@ -1,13 +1,12 @@
 """Which file of tests a worker may begin, so that the memory of all tests that run stays within a budget.
 
 Some files start a whole robot, or two, as processes; others compute in the worker alone. A file waits, and a worker
-takes a later one meanwhile, as long as there is no room for it. What a test needed in the last run is known from the
-record (`tests/run_memory.py`); without a record its markers tell what it may need.
+takes a later one meanwhile, as long as there is no room for it. What a test needs is known from the last run, or from
+one whose figures are kept (`tests/run_known.py`); what its markers tell counts for files that are new.
 """
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -15,32 +14,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from run_memory import LEAST_MB, MEMORY
+from run_known import LARGE_MB, Known, file_of, kept, recorded
+from run_memory import LEAST_MB
 
 BUDGET_MB = 1000.0
 """For what the tests that run at a time need. Pytest and its workers share 130 MB more."""
-LARGE_MB = 400.0
-"""The tests of a file that need more are a job of their own, so that the rest fits beside more. Not so where they share
-a fixture of their file: what it has started runs during all of them, and each job would start it again."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0), ({"zenoh", "process"}, 120.0), ({"zenoh"}, 80.0))
-"""Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
-USUAL_MB = {
-    # two robots, or one over several hosts
-    "test_faults_two_robots.py": 740.0, "test_site_hosts.py": 690.0, "test_site_clocks.py": 410.0,
-    "test_site_intruders.py": 850.0,
-    # a browser, some with a robot
-    "test_cockpit_browser.py": 740.0, "test_cockpit_page.py": 470.0, "test_cockpit_page_driving.py": 450.0,
-    "test_cockpit_browser_gate.py": 280.0,
-    # a robot with more processes than most
-    "test_readme.py": 590.0, "test_wire_robot.py": 590.0, "test_stop_live.py": 560.0, "test_client_live.py": 560.0,
-    # one with fewer
-    "test_faults_asleep.py": 370.0,
-    # what they make in the worker, or in a process of their own
-    "test_faults_barrage.py": 410.0, "test_faults_speed.py": 320.0, "test_cli_surroundings.py": 190.0,
-    "test_capture_export.py": 170.0, "test_wall_clock.py": 160.0, "test_declared.py": 150.0,
-    "test_cli_endings.py": 130.0, "test_capture_tables.py": 120.0,
-}  # fmt: skip
-"""Files whose tests need something else than their markers tell, and what the most demanding one needs."""
+"""Markers of tests of unknown files, and what those need that have all of them. The first: the processes of a robot."""
 URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
 
@@ -52,32 +32,45 @@ class Job(NamedTuple):
     need_mb: float
 
 
-def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
-    """The tests by file and by what they need, in their order. The record is in the folder, if there is one."""
-    known: dict[str, float] | None = None
-    if folder is not None and (file := folder / MEMORY).is_file():
-        known = json.loads(file.read_text()).get("own_mb")
+def jobs_of(items: Iterable[pytest.Item], folder: Path | None, usual: Known | None = None) -> list[Job]:
+    """The tests by file and by what they need, those first that take longest; else in their order.
+
+    `folder`: the record, if there is one; `usual`: what is known of the files that it lacks, None for what is kept.
+
+    Tests that need much are a job of their own, so that the rest of their file fits beside more. Not so where they
+    share a fixture of their file: what it has started runs during all of them, and each job would start it again.
+    """
+    record, usual = recorded(folder), usual or kept()
+    if record is not None and not record.own_mb:
+        record = None  # it was not watched
     found: dict[tuple[Path, bool], list[pytest.Item]] = defaultdict(list)
     needs_mb: dict[tuple[Path, bool], float] = defaultdict(float)
     items = list(items)
     whole = {item.path for item in items if _shares(item)}
     for item in items:
-        need_mb = _need_mb(item, known)
+        need_mb = _need_mb(item, record, usual)
         part = item.path, need_mb > LARGE_MB and item.path not in whole
         found[part].append(item)
         needs_mb[part] = max(needs_mb[part], need_mb)
-    return [Job(of_part, needs_mb[part]) for part, of_part in found.items()]
+    jobs = [Job(of_part, needs_mb[part]) for part, of_part in found.items()]
+    return sorted(jobs, key=lambda job: -_takes_s(job, record, usual))
 
 
-def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
-    if known is not None and item.nodeid in known:
-        return max(known[item.nodeid], LEAST_MB)
-    marks = {mark.name for mark in item.iter_markers()}
-    if item.path.name in USUAL_MB and marks & {"zenoh", "sim", "process"}:
-        return USUAL_MB[item.path.name]
-    guesses = (
-        GUESSED_MB if known is None else GUESSED_MB[:1]
-    )  # what the looks have missed took a moment, as no robot does
+def _takes_s(job: Job, record: Known | None, usual: Known) -> float:
+    tests = [item.nodeid for item in job.items]
+    known = record if record is not None and file_of(tests[0]) in record.files else usual
+    return known.takes_s(tests)
+
+
+def _need_mb(item: pytest.Item, record: Known | None, usual: Known) -> float:
+    file, marks = file_of(item.nodeid), {mark.name for mark in item.iter_markers()}
+    guesses: Iterable[tuple[set[str], float]] = GUESSED_MB
+    if record is not None and file in record.files:
+        if (need_mb := record.need_mb(item.nodeid)) is not None:
+            return max(need_mb, LEAST_MB)
+        guesses = GUESSED_MB[:1]  # what the looks have missed took a moment, as no robot does
+    elif (need_mb := usual.need_mb(item.nodeid)) is not None:
+        return need_mb if marks & {"zenoh", "sim", "process"} else LEAST_MB
     return next((mb for needed, mb in guesses if needed <= marks), LEAST_MB)
 
 

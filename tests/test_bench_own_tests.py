@@ -40,6 +40,7 @@ def test_files_are_summed_over_the_parts_of_a_run(tmp_path: Path, monkeypatch: p
                 "peak_mb": 800.0,
                 "at_s": 3.0,
                 "looks": [[1.0, 700.0, {"tests/a.py - one": 650.0}], [3.0, 800.0, {"tests/b.py": 500.0, "rest": 90.0}]],
+                "idle_s": [0.5, 1.5],
                 "largest": [["x", 500.0, "tests/b.py"]],
             }
         )
@@ -53,7 +54,8 @@ def test_files_are_summed_over_the_parts_of_a_run(tmp_path: Path, monkeypatch: p
     files, largest, over_time = report.tables
     assert files.rows == [["a.py", "3", "10.0", "7.5", "90"], ["b.py", "2", "1.0", "0.5", "90"]]
     assert largest.rows == [["x", "tests/b.py", "500"]]
-    assert over_time.rows == [["0", "800", "b.py 500, rest 90"]]
+    assert over_time.rows == [["0", "800", "0.5", "b.py 500, rest 90"]]
+    assert found["processor time that nobody used"].median == 1.0
 
 
 def test_a_run_that_took_too_long_or_too_much_memory_misses_its_bounds(

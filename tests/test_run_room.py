@@ -12,9 +12,10 @@ from typing import Any
 
 import pytest
 import run_memory
+from run_known import LARGE_MB, Known
 from run_memory import AGAIN, LEAST_MB, MEMORY, RUNNING, WORKER, Watch, memory_mb
-from run_record import FOLDER, LONG, wall_s_of
-from run_room import LARGE_MB, USUAL_MB, Room, jobs_of
+from run_record import FOLDER
+from run_room import Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
@@ -40,29 +41,43 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
     return found
 
 
-def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
+def test_without_a_record_a_file_needs_what_is_kept_of_it_or_what_its_most_demanding_test_may_need(
+    tmp_path: Path,
+) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", next(iter(USUAL_MB))))
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", "d.py"))
+    pure = item("d.py::pure")
+    usual = Known(own_mb={"d.py": 740.0})
     for folder in (None, tmp_path):
-        jobs = jobs_of([*items, robot, robots], folder)
-        assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
+        jobs = jobs_of([*items, robot, robots, pure], folder, usual)
+        assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots], [pure]]
         needs_mb = [job.need_mb for job in jobs]
-        assert needs_mb[0] == LEAST_MB
-        assert needs_mb == sorted(set(needs_mb))
+        assert needs_mb[0] == needs_mb[4] == LEAST_MB
+        assert needs_mb[:4] == sorted(set(needs_mb[:4]))
+        assert needs_mb[3] == 740.0
 
 
-def test_the_files_that_are_known_are_there() -> None:
-    names = {*USUAL_MB, *(f"test_{name}.py" for name in LONG)}
-    assert [name for name in names if not (Path(__file__).parent / name).is_file()] == []
+def test_what_is_kept_counts_for_files_that_the_record_lacks(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0}}))
+    usual = Known({"b": 9.0}, {"a": 390.0, "b": 200.0, "b::big": LARGE_MB + 1})
+    jobs = jobs_of([item("a::a"), item("a::b", "sim"), item("b::a", "sim"), item("b::big", "sim")], tmp_path, usual)
+    assert [(job.items[0].nodeid, job.need_mb) for job in jobs] == [
+        ("b::a", 200.0), ("b::big", LARGE_MB + 1), ("a::a", 300.0),
+    ]  # fmt: skip
 
 
-def test_without_a_record_the_longest_files_come_first(tmp_path: Path) -> None:
-    took_s = wall_s_of(tmp_path / "none")
-    assert sorted(took_s, key=lambda file: -took_s[file]) == [f"tests/test_{name}.py" for name in LONG]
+def test_of_a_file_in_parts_each_part_counts_as_long_as_it_took_itself(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::large": LARGE_MB + 1, "a::small": 90.0, "b::a": 90.0}}))
+    took_s = {"a::small": 1.0, "a::large": 8.0, "b::a": 5.0}
+    run = {"files": {"a": {"wall_s": 9.0}, "b": {"wall_s": 5.0}}, "tests_s": took_s}
+    (tmp_path / "pytest-1.json").write_text(json.dumps(run))
+    jobs = jobs_of([item("a::small"), item("a::large"), item("b::a")], tmp_path)
+    assert [job.items[0].nodeid for job in jobs] == ["a::large", "b::a", "a::small"]
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
     (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": 100.0, "c::a": 1.0}}))
+    (tmp_path / "pytest-1.json").write_text(json.dumps({"files": {"new": {"wall_s": 0.0}}}))  # no look has seen it
     jobs = jobs_of([item("a::b"), item("a::a"), item("c::a"), item("new::a", "sim")], tmp_path)
     assert [job.need_mb for job in jobs] == [300.0, LEAST_MB, LEAST_MB]
     (robot,) = jobs_of([item("new::b", "zenoh", "sim", "process")], tmp_path)
@@ -113,6 +128,7 @@ def test_what_a_fixture_has_started_is_needed_by_every_test_during_which_it_runs
         started.kill()
     assert watch.own_mb["a::later"] > 60.0
     assert "a::first" not in watch.own_mb
+    assert [0 <= idle_s < 3600 for idle_s in watch.idle_s] == [True]
     ((_, _, parts),) = watch.looks
     assert parts["a"] > 60.0
 

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from run_record import wall_s_of
 from run_spread import WORKERS, jobs_by_kind
 
 from bench.own_tests import RECORD
@@ -87,6 +86,8 @@ def test_the_run_leaves_a_record(ran: tuple[Path, subprocess.CompletedProcess[st
     assert files["test_times.py"]["tests"] == 2
     assert all(0 <= figures["processor_s"] < 60 for figures in files.values())
     assert files["test_later.py"]["memory_mb"] > 5
+    tests_s = json.loads(part.read_text())["tests_s"]
+    assert len(tests_s) == sum(figures["tests"] for figures in files.values())
     assert RECORD.name == "last"
 
 
@@ -96,14 +97,3 @@ def test_a_test_is_in_one_job(request: pytest.FixtureRequest) -> None:
     assert set(jobs) == set(WORKERS)
     placed = [item.nodeid for of_kind in jobs.values() for job in of_kind for item in job.items]
     assert sorted(placed) == sorted(item.nodeid for item in items)
-
-
-def test_the_files_that_took_longest_come_first_and_without_a_record_those_that_are_known_to_be_long(
-    tmp_path: Path,
-) -> None:
-    guessed = wall_s_of(tmp_path / "missing")
-    assert guessed
-    assert all((HERE.parent / file).is_file() for file in guessed)
-    (tmp_path / "pytest-1.json").write_text(json.dumps({"files": {"a.py": {"wall_s": 3.0}, "b.py": {"wall_s": 1.0}}}))
-    (tmp_path / "pytest-2.json").write_text(json.dumps({"files": {"b.py": {"wall_s": 4.0}}}))
-    assert wall_s_of(tmp_path) == {"a.py": 3.0, "b.py": 4.0}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -16,8 +17,9 @@ from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, CancelRequest, Message, PlannerStatus, TaskReply
 from cocoro.node import Node
-from cocoro.testing import CoreUnderTest, JumpingClock, ServiceUnderTest, execute_again, in_virtual_time
+from cocoro.testing import CoreUnderTest, JumpingClock, ServiceUnderTest, execute_again, in_virtual_time, settle
 from cocoro.topics import STEPS, Topic
+from cocoro.vloop import VirtualTimeLoop
 
 _luck = count()
 
@@ -77,6 +79,38 @@ async def test_time_passes_as_it_is_told_to() -> None:
         assert service.node.now_ns() == 2_500_000_000
         with pytest.raises(AssertionError, match="still not so after 3 s"):
             await service.until(lambda: False, timeout_s=3.0)
+
+
+@in_virtual_time
+async def test_settling_runs_all_that_is_due_now_and_takes_no_turns_after_that() -> None:
+    loop, seen = asyncio.get_running_loop(), list[object]()
+    assert isinstance(loop, VirtualTimeLoop)
+
+    async def chain() -> None:
+        for link in range(20):
+            await asyncio.sleep(0)
+            seen.append(link)
+        loop.call_at(loop.time(), seen.append, "timer")
+
+    chained = asyncio.ensure_future(chain())
+    later = loop.call_later(0.001, seen.append, "later")
+    await settle()
+    assert seen == [*range(20), "timer"]
+    assert chained.done()
+    turns: list[None] = []
+
+    run_once: Callable[[], None] = loop._run_once  # type: ignore[attr-defined]
+
+    def counted() -> None:
+        turns.append(None)
+        run_once()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "_run_once", counted)
+        await settle()
+    assert 1 <= len(turns) <= 2
+    assert loop.time() == 0.0
+    later.cancel()
 
 
 @in_virtual_time
