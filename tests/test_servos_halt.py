@@ -10,10 +10,10 @@ from types import TracebackType
 from services.servos.bus import SilentError
 from services.servos.dynamixel import DYNAMIXEL
 from services.servos.family import ServoReading
-from services.servos.group import ServoStatus, ServoTask
 from services.servos.line import CycleResult, ServoLine
 from services.servos.motion import HOLD_RADPS
 from services.servos.orders import GroupOrders
+from services.servos.watch import ServoStatus, ServoTask
 
 PATIENCE_S = 60.0
 FAR = {5: (900, 30)}

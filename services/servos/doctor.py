@@ -11,8 +11,8 @@ from services.servos import tools
 from services.servos.bus import PortError, ServoBus, SilentError
 from services.servos.families import FAMILIES
 from services.servos.family import ServoFamily
-from services.servos.group import HOT_C
 from services.servos.service import ServosConfig
+from services.servos.watch import HOT_C
 
 __all__ = ["check"]
 

@@ -10,7 +10,7 @@ from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
 from services.servos.family import ServoFamily
 from services.servos.motion import AT_GOAL_RAD, JointMotion
-from services.servos.watch import ServoStatus, ServoTask, ServoWatch, WatchedServo
+from services.servos.watch import ServoStatus, ServoWatch, WatchedServo
 
 STALE_NS = NS // 10
 """A reading is published until it is older than this, in case that the next answer is missing."""
@@ -61,14 +61,13 @@ class ServoGroup(ServoWatch[ServoJoint]):
     def latch(self) -> LatchState:
         return self._latch
 
-    @property
-    def stopped_by(self) -> str:
+    def stopped_by(self, now_ns: int) -> str:
         return STOPPED_BY[self.latch]
 
     def command(self, command: ServoCommand, now_ns: int) -> str:
         """Accept all goals or none. Returns '' when accepted, otherwise the reason for refusing."""
-        if self.stopped_by:
-            return self.stopped_by
+        if why := self.stopped_by(now_ns):
+            return why
         if not is_fresh(command.stamp_ns, now_ns, self._max_age_s):
             return "too old"
         if unknown := self.unknown(command.joints):
@@ -91,25 +90,7 @@ class ServoGroup(ServoWatch[ServoJoint]):
                 if (position_rad := one.position_rad) is not None and one.motion.goal_rad is not None:
                     one.motion.hold(position_rad)
 
-    def relax(self, names: Iterable[str]) -> list[str]:
-        """Let joints go limp until `hold`; returns their names."""
-        for one in (chosen := self._named(names)):
-            one.relaxed = True
-            one.let_go()
-            self._tasks[one.number] = ServoTask("relax", one.number)
-        return [one.name for one in chosen]
-
-    def hold(self, names: Iterable[str]) -> list[str]:
-        """Make joints hold where they are, also relaxed ones; returns their names."""
-        for one in (chosen := self._named(names)):
-            one.relaxed = False
-            one.let_go()
-            if one.inspected and not one.fault:
-                self._tasks[one.number] = ServoTask("enable", one.number)
-        return [one.name for one in chosen]
-
     def new_epoch(self) -> None:
-        """The clock restarted: earlier commands and readings belong to no time of the new epoch."""
         for one in self.joints.values():
             one.motion.forget_time()
             one.read_ns = 0
@@ -147,5 +128,5 @@ class ServoGroup(ServoWatch[ServoJoint]):
             torque_enabled=tuple(one.enabled for one, _, _ in recent),
             faults=self.latched_faults(),
             latch=self.latch,
-            stopped_by=self.stopped_by,
+            stopped_by=self.stopped_by(now_ns),
         )

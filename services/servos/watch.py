@@ -6,6 +6,7 @@ orders, which it writes in every cycle, and tasks, each done once with one servo
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
@@ -89,7 +90,7 @@ class WatchedServo:
 W = TypeVar("W", bound=WatchedServo)
 
 
-class ServoWatch(Generic[W]):
+class ServoWatch(ABC, Generic[W]):
     """Every `now_ns` is the robot's clock."""
 
     remedy = "cocoro servos clear"
@@ -105,9 +106,21 @@ class ServoWatch(Generic[W]):
         self._disturbed = Recent()
 
     @property
+    @abstractmethod
     def latch(self) -> LatchState:
         """The emergency stop's; servos are enabled while it is released."""
-        raise NotImplementedError
+
+    @abstractmethod
+    def stopped_by(self, now_ns: int) -> str:
+        """Why commands are not obeyed; '' when they are."""
+
+    @abstractmethod
+    def new_epoch(self) -> None:
+        """The clock restarted: earlier commands and readings belong to no time of the new epoch."""
+
+    def moved(self, spun_mps: Sequence[float], now_ns: int) -> None:
+        """A cycle has ended; all else of it is told already. `spun_mps`: what was ordered of the wheels, if any are on
+        the line."""
 
     # --- requests -----------------------------------------------------------------------------------
 
@@ -121,6 +134,23 @@ class ServoWatch(Generic[W]):
                 cleared.append(one.name)
                 self._enable_if_due(one)
         return cleared
+
+    def relax(self, names: Iterable[str]) -> list[str]:
+        """Let servos go limp until `hold`; returns their names."""
+        for one in (chosen := self._named(names)):
+            one.relaxed = True
+            one.let_go()
+            self._tasks[one.number] = ServoTask("relax", one.number)
+        return [one.name for one in chosen]
+
+    def hold(self, names: Iterable[str]) -> list[str]:
+        """Make servos hold where they are, also relaxed ones; returns their names."""
+        for one in (chosen := self._named(names)):
+            one.relaxed = False
+            one.let_go()
+            if one.inspected and not one.fault:
+                self._tasks[one.number] = ServoTask("enable", one.number)
+        return [one.name for one in chosen]
 
     def unknown(self, names: Iterable[str]) -> list[str]:
         return [name for name in names if name not in self._by_name]

@@ -65,6 +65,10 @@ class Motor:
     slope: int
     """Distance from the goal, counts, below which it pushes with less than its limit."""
     punch: float
+    endless: int | None = None
+    """Speed, counts of the family's unit with a sign, of a servo that turns endlessly; None: it goes to its goal."""
+    acceleration: int = 0
+    """How fast that speed changes, the family's unit per second; 0: at once."""
 
 
 class EmulatedServo(ABC):
