@@ -73,6 +73,10 @@ class EmulatedFeetech(EmulatedServo):
         super().power_up()
         self.stand((shaft - self._offset) % TURN)
 
+    def be_wheel(self) -> None:
+        self.put(33, WHEEL)
+        self._saved = bytes(self._cells[: self.ROM_END])
+
     def stand(self, position: int) -> None:
         self._shaft = position + self._offset
         super().stand(position)

@@ -124,6 +124,10 @@ class EmulatedServo(ABC):
         self._tripped = 0
         self._straining_ns = None
 
+    def be_wheel(self) -> None:
+        """Set it up to turn endlessly, as its owner did before. Raises ValueError when no such setup is emulated."""
+        raise ValueError(f"a servo of model {self._model} is not emulated as a wheel")
+
     def stand(self, position: int) -> None:
         """Set the position that it measures, counts; its goal is the same."""
         self.put(self.AT.position, position)
