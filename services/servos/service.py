@@ -113,7 +113,7 @@ class LineService:
         """`nodes`: by group on the line, its participant of the mesh; `base`: that of the wheels, if their servos are
         on the line and this process drives them. One of them at least."""
         groups = [GroupService(node, group) for group, node in nodes.items()]
-        node = next((*nodes.values(), base))
+        node = (*nodes.values(), base)[0]
         assert node is not None
         row = node.robot.networks[line]
         family = FAMILIES[row.protocol]

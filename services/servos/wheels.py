@@ -179,6 +179,7 @@ class WheelGroup(ServoWatch[WheelJoint]):
         before_ns, self._rolled_ns = self._rolled_ns, at_ns
         if before_ns is not None:
             self._odometry.advance([one.rolled_m for one in servos], (at_ns - before_ns) / NS)
+            self._odometry.measured([one.speed_mps for one in servos])
         for one in servos:
             one.rolled_m, one.is_rolled = 0.0, False
 

@@ -103,6 +103,8 @@ class WireWheel:
         self._metres_a_speed = servo.direction * units.speed_radps * wheel.radius_m
         self._start = round(units.centre_count)
         self.sign = servo.direction
+        self.blocked = False
+        """Whether something holds it."""
         self.mps = 0.0
         """At which it is driven now."""
         self._rolled_m = self._rolls_mps = self.load = 0.0
@@ -126,6 +128,8 @@ class WireWheel:
         change_mps = min(max(asked_mps, -top_mps), top_mps) - self.mps
         reach_mps = motor.acceleration * abs(self._metres_a_speed) * dt_s if motor.acceleration else abs(change_mps)
         self.mps += copysign(min(abs(change_mps), reach_mps), change_mps)
+        if self.blocked:
+            self.mps = 0.0
         return self.mps
 
     def sense(self, rolled_m: float, torque_nm: float, dt_s: float) -> None:
