@@ -95,6 +95,11 @@ class ServoPlace(NamedTuple):
     network: str
     id: int
 
+    @property
+    def title(self) -> str:
+        """Its name, for people."""
+        return self.name if self.kind == "joint" else f"wheel {self.name}"
+
 
 def check_lines(servos: Iterable[ServoPlace], lines: Collection[str]) -> None:
     """Raises ValueError for a servo on a line that there is not, a line without servos, and two servos with one ID on

@@ -5,7 +5,9 @@ from __future__ import annotations
 from math import hypot
 
 import pytest
-from wheels_rig import FAMILY, MS, WheelsRig
+from wheels_rig import FAMILY, MS, WheelsRig, lekiwi
+
+from cocoro.robot import Robot
 
 STAND_S = 0.3
 FAST_MPS = 0.2
@@ -57,14 +59,15 @@ def test_a_position_runs_on_from_turn_to_turn(rig: WheelsRig) -> None:
     assert rig.states[-1].odometry_yaw_rad == pytest.approx(1.5 * 6.0, rel=0.06)
 
 
-def test_a_wheel_that_is_mounted_the_other_way_round_drives_the_same_way() -> None:
-    rig = WheelsRig().release()
-    joint = next(iter(rig.core.servos.values()))
-    assert joint.speed_mps == 0.0
-    counts = rig.orders.due(rig.now_ns / 1e9, answering=True)
-    assert set(counts) == {7, 8, 9}
-    assert FAMILY.spin(-3) == bytes([3, 0x80])
-    assert FAMILY.spin(3000) == (3000).to_bytes(2, "little")
+def test_a_servo_that_is_mounted_the_other_way_round_turns_the_other_way() -> None:
+    data = lekiwi().to_data()
+    data["base"]["wheel"][0]["servo"]["direction"] = -1
+    rig = WheelsRig(robot=Robot.from_data(data)).release()
+    rig.drive(turn_radps=1.0)
+    rig.run(1.0)
+    assert [servo.motor.endless > 0 for servo in rig.wheels.values()] == [False, True, True]  # type: ignore[operator]
+    assert rig.states[-1].turn_rate_radps == pytest.approx(1.0, rel=0.05)
+    assert rig.states[-1].odometry_yaw_rad > 0.7
 
 
 def test_the_ramp_keeps_the_direction_of_the_motion(rig: WheelsRig) -> None:
@@ -83,7 +86,9 @@ def test_a_servo_that_is_no_wheel_never_turns(rig: WheelsRig) -> None:
     other.drive(0.1)
     other.run(1.0)
     assert other.stood_after(0) == 0.0
-    assert "wheel left: servo 7 is not set up as a wheel (mode 1); `cocoro base recover`" in faults(other)
+    assert "wheel left: servo 7 is not set up as a wheel: `cocoro servos set-wheel 7`; `cocoro base recover`" in faults(
+        other
+    )
     other.wheels["left"].put(33, 1)
     other.core.recover()
     other.run(0.6)

@@ -79,8 +79,8 @@ class VirtualPort(CheckedPort):
 class WheelsRig:
     """`pass_time` moves the plant, and looks at every step whether the wheels turn."""
 
-    def __init__(self, seed: int = 0) -> None:
-        self.robot = lekiwi()
+    def __init__(self, seed: int = 0, robot: Robot | None = None) -> None:
+        self.robot = robot or lekiwi()
         base, units = self.robot.base, FAMILY.units
         self.now_ns = START_NS
         self.bus_of_servos = EmulatedServoBus(servo_of(777, number, 5.0) for number in range(1, 10))

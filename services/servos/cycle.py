@@ -242,7 +242,7 @@ class LineCycle:
     def _refuse_unless_wheel(self, bus: ServoBus, number: int) -> None:
         """A servo that is not set up as a wheel may be one of the arm with a wrong ID."""
         if not bus.is_wheel(number):
-            raise RefusedWriteError(f"servo {number} is not set up as a wheel (mode 1)")
+            raise RefusedWriteError(f"servo {number} is not set up as a wheel: `cocoro servos set-wheel {number}`")
 
     def _revive(self, bus: ServoBus, number: int) -> None:
         """Write what ends a shutdown, if it has shut down."""
