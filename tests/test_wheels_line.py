@@ -133,7 +133,7 @@ def test_the_stop_path_stops_it_without_the_event_loop(rig: WheelsRig) -> None:
 def test_an_order_that_the_event_loop_does_not_renew_expires(rig: WheelsRig) -> None:
     driving(rig)
     since_ns = rig.now_ns
-    rig.take = lambda _: None  # type: ignore[method-assign]
+    rig.take = lambda result: None  # type: ignore[method-assign]
     rig.run(0.8)
     assert rig.stood_after(since_ns) <= STAND_S
 

@@ -202,7 +202,7 @@ class WireMotors:
         """What the firmware's sensors measure."""
         base = self.base
         left_m, right_m = (0.0, 0.0) if self.wheels else base.counted_m
-        driven = {**self.servos, **self.wheels}
+        driven: dict[int, WireServo | WireWheel] = {**self.servos, **self.wheels}
         shafts = {number: one.measurements for number, one in driven.items()}
         return PlantState(time_ns, left_m, right_m, base.bumper.left, base.bumper.right, shafts)
 
