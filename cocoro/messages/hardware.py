@@ -153,8 +153,8 @@ class ServoCommand(Message):
 
 
 class RecoverRequest(msgspec.Struct, kw_only=True):
-    """Restores the mode of a Create that left it by itself (at a cliff, a wheel drop, the charger), or clears the faults
-    of wheels that servos turn."""
+    """Restores the mode of a Create that left it by itself (at a cliff, a wheel drop, the charger), or clears the
+    faults of wheels that servos turn."""
 
 
 class RecoverReply(msgspec.Struct, kw_only=True):
