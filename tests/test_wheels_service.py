@@ -20,11 +20,15 @@ from wheels_rig import lekiwi
 
 from cocoro import topics
 from cocoro.clock import RealClock
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest, ResetRequest
 from cocoro.robot import Robot
 from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseConfig
+from services.servos.bus import ServoBus
+from services.servos.doctor import check
+from services.servos.service import ServosConfig
+from services.servos.tools import set_wheel
 from services.servos.wheel_service import WheelService
 from sim.wire.emulator import Emulator, SimplePlant
 from sim.wire.models import servo_of, wheel_of
@@ -192,3 +196,22 @@ def test_each_base_has_the_process_that_drives_it() -> None:
         ConfigError, match="no servos turn the wheels of calliope: name the processes `base` and `servos`"
     ):
         asyncio.run(scenario("services.servos.mobile", {}, Robot.load()))
+
+
+def test_the_doctor_knows_wheels_and_a_tool_sets_them_up(bench: WheelBench) -> None:
+    config = ServosConfig(ports={"bus": bench.port}, reply_s=0.2)
+    assert {one.state for one in check(config, lekiwi(), "robbie")} == {"ok"}
+    back = bench.wheels[1]
+    bench.emulator.call(lambda: back.put(33, 0))
+    (bad,) = [one for one in check(config, lekiwi(), "robbie") if one.state == "bad"]
+    assert bad.name == "servo 8, wheel back"
+    assert "is not set up as a wheel: `cocoro servos set-wheel 8`" in bad.text
+    with ServoBus(bench.port, 1_000_000, 0.2, tries=3) as bus:
+        set_wheel(bus, 8, turns=True)
+        assert bus.is_wheel(8)
+        bench.emulator.call(back.power_up)
+        assert bus.is_wheel(8), "it keeps that without power"
+        set_wheel(bus, 8, turns=False)
+        assert not bus.is_wheel(8)
+        with pytest.raises(RefusedError, match="no servo answers as 99"):
+            set_wheel(bus, 99, turns=True)
