@@ -111,7 +111,7 @@ class Port:
     def write(self, data: bytes) -> None:
         """Write without waiting: what the line does not accept now would be late."""
         for _ in range(2):  # a port that was unplugged and plugged in again is another one
-            if self._fd is None and not self.open():
+            if not self.open():
                 return
             assert self._fd is not None
             try:
@@ -122,11 +122,12 @@ class Port:
                 self.why = _sentence(error, self._path)
                 self.close()
             else:
-                self.why = ""
                 return
 
     def open(self) -> bool:
-        """Open it as the service does, which may not have done so yet."""
+        """Open it, unless it is, as the service does, which may not have done so yet."""
+        if self._fd is not None:
+            return True
         try:
             self._fd = os.open(self._path, os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
             tty.setraw(self._fd, termios.TCSANOW)
@@ -138,6 +139,7 @@ class Port:
             self.why = _sentence(error, self._path)
             self.close()
             return False
+        self.why = ""
         return True
 
     def close(self) -> None:
@@ -166,6 +168,7 @@ class Guard(GuardProcess):
             self._answer(asked, now_ns)
         if stops or now_ns - self._reported_ns > QUIET_NS:
             self._reported_ns = now_ns
+            self._port.open()  # before it is needed: who cannot write guards nothing
             self._send({"t": now_ns, "stops": self._logic.stops, "why": self._port.why})
         return True
 

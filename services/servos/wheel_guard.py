@@ -27,7 +27,7 @@ class Report(msgspec.Struct):
     stops: int
     """Count of emergency stops that it received on its own address."""
     why: str = ""
-    """Why it cannot write to the port; '' when it could, or has not tried."""
+    """Why it cannot write to the port; '' when it can."""
 
 
 _REPORT = msgspec.json.Decoder(Report)
@@ -82,7 +82,8 @@ class WheelGuard(GuardKeeper):
 
     def _heard(self, message: bytes) -> None:
         report = _REPORT.decode(message)
-        self._orders.guarded(report.t + round(HANGS_S * NS))
+        if not report.why:
+            self._orders.guarded(report.t + round(HANGS_S * NS))
         self._on_report(report)
 
     def _halt(self, *, for_good: bool) -> None:

@@ -63,7 +63,7 @@ class WheelService(LineParticipant):
         self.orders.go_on()  # these orders know of the latch
 
     def _guarded(self, report: Report) -> None:
-        self.core.guard_fault = ""
+        self.core.guard_fault = report.why and f"the guard of the wheels cannot write to them: {report.why}"
         stops, self._stops = self._stops, report.stops
         if report.stops > stops:
             self._latch.stop("the guard of its wheels, which received a stop")

@@ -23,9 +23,9 @@ FRESH_NS = 180_000_000
 LEAP_MPS, LEAP_COUNTS, LEAPS = 2.0, 40, 3
 """A position that a wheel cannot have come to since its last one, at this many times its highest speed, is not
 believed: one damaged answer in 256 has a valid checksum. After so many in a row it is: it was turned meanwhile."""
-HELD_SHARE, HELD_FROM_MPS, HELD_NS = 0.4, 0.04, NS // 10
-"""A wheel that turns at less than this share of its ordered speed, if that is fast enough to tell, for this long is
-held up. A servo's own protection against overload takes 2 s."""
+HELD_SHARE, HELD_FROM_MPS, HELD_NS, HELD_READINGS = 0.4, 0.04, NS // 10, 6
+"""A wheel that turns at less than this share of its ordered speed, if that is fast enough to tell, for this long and by
+so many readings in a row is held up. A servo's own protection against overload takes 2 s."""
 LET_GO_NS = NS
 """Wheels that were held up may turn again when nothing was asked of them for this long."""
 
@@ -49,6 +49,7 @@ class WheelJoint(WatchedServo):
         self.rolled_m = 0.0
         """Since the odometry took it last."""
         self.held_since_ns: int | None = None
+        self._held_readings = 0
 
     @property
     def speed_mps(self) -> float:
@@ -86,7 +87,15 @@ class WheelJoint(WatchedServo):
         if abs(ordered_mps) < HELD_FROM_MPS or ahead_mps >= HELD_SHARE * abs(ordered_mps):
             self.held_since_ns = None
         elif self.held_since_ns is None or self.held_since_ns > now_ns:
-            self.held_since_ns = now_ns
+            self.held_since_ns, self._held_readings = now_ns, 1
+        else:
+            self._held_readings += 1
+
+    def is_held(self, now_ns: int) -> bool:
+        """Whether it has not turned as ordered for too long."""
+        if self.held_since_ns is None or self._held_readings < HELD_READINGS:
+            return False
+        return now_ns - self.held_since_ns >= HELD_NS
 
     def forget_time(self) -> None:
         """The clock restarted."""
@@ -191,7 +200,7 @@ class WheelGroup(ServoWatch[WheelJoint]):
         if self.held_up and now_ns - self._asked_ns > LET_GO_NS:
             self.held_up = ""
         for one in self.servos.values():
-            if one.held_since_ns is not None and now_ns - one.held_since_ns >= HELD_NS and not self.held_up:
+            if one.is_held(now_ns) and not self.held_up:
                 self.held_up = f"{one.name} is held up: it does not turn as ordered. Is it blocked?"
 
     def port_lost(self, why: str) -> None:
