@@ -8,6 +8,7 @@ import msgspec
 
 from cocoro.differential import Differential
 from cocoro.drive import WheelDrive
+from cocoro.joints import ServoPlace
 from cocoro.omni import Omni, OmniWheel
 from cocoro.units import Positive
 
@@ -56,12 +57,21 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             raise ValueError(f"two wheels are called {twice[0]!r}")
         if len(names) < 3:
             raise ValueError(f"kind = 'omni' needs three [[base.wheel]] at least, not {len(names)}")
+        without = [wheel.name for wheel in self.wheel if wheel.servo is None]
+        if without and len(without) < len(names):
+            raise ValueError(f"wheel {without[0]} has no servo, but others have: servos turn all wheels or none")
         Omni(self.wheel)
 
     @property
     def drive(self) -> WheelDrive:
         """Its kinematics."""
         return Omni(self.wheel) if self.kind == "omni" else Differential(self.axle_m)
+
+    @property
+    def servo_places(self) -> tuple[ServoPlace, ...]:
+        """The servos that turn its wheels, in the order of `drive`; none where something else does."""
+        servos = ((wheel.name, wheel.servo) for wheel in self.wheel)
+        return tuple(ServoPlace("wheel", name, one.network, one.id) for name, one in servos if one is not None)
 
     @property
     def axle_m(self) -> float:

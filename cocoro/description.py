@@ -14,10 +14,10 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from cocoro.base import Base
-from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses
+from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses, check_wheels
 from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker, Reach
 from cocoro.errors import ConfigError
-from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
+from cocoro.joints import Group, JointRow, LineName, Network, ServoPlace, check_groups, check_lines
 from cocoro.link_row import LinkRow
 from cocoro.units import Vec3
 
@@ -166,7 +166,9 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def _check_limbs(self) -> None:
         arm, joints = self.arm, {joint.name for joint in self.joint}
-        check_lines(self.joint, self.network)
+        servos = [ServoPlace("joint", row.name, row.network, row.id) for row in self.joint]
+        check_lines([*servos, *self.base.servo_places], self.network)
+        check_wheels(self.base.servo_places, self.network)
         limbs = [("claw", set(self.claw.open_sign)), ("head", self._head_joints)]
         limbs.append(("arm", {*arm.joints, arm.roll}))
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]

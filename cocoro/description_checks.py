@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
+from cocoro.joints import Network, ServoPlace
 from cocoro.units import Vec3
 
 
@@ -61,3 +62,15 @@ def check_poses(poses: Mapping[str, Mapping[str, float]], arm: tuple[str, ...]) 
     for name, wanted in (("park", arm), ("upright", arm), ("unfolded", arm[1:])):
         if missing := [joint for joint in wanted if joint not in poses.get(name, {})]:
             raise ValueError(f"pose {name}: the angle of {missing[0]!r} is missing")
+
+
+def check_wheels(servos: Sequence[ServoPlace], networks: Mapping[str, Network]) -> None:
+    """Refuses servos of wheels that are on several lines, since they turn together, and those whose positions do not
+    run on over a whole turn."""
+    if len({one.network for one in servos}) > 1:
+        raise ValueError(
+            f"the servos of the wheels are on several networks: {', '.join(one.network for one in servos)}"
+        )
+    for one in servos:
+        if (protocol := networks[one.network].protocol) != "feetech":
+            raise ValueError(f"wheel {one.name}: no wheel is driven by a servo that speaks {protocol}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from math import radians
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -87,15 +87,30 @@ class Joint(JointRow, frozen=True):
         return self.direction * (count - self.centre_count) * self.units.count_rad
 
 
-def check_lines(joints: Iterable[JointRow], lines: Collection[str]) -> None:
-    """Raises ValueError for a joint on a line that there is not, a line without joints, and two servos with one ID on
+class ServoPlace(NamedTuple):
+    """Where a servo is: what it turns, its line and its ID there."""
+
+    kind: Literal["joint", "wheel"]
+    name: str
+    network: str
+    id: int
+
+    @property
+    def title(self) -> str:
+        """Its name, for people."""
+        return self.name if self.kind == "joint" else f"wheel {self.name}"
+
+
+def check_lines(servos: Iterable[ServoPlace], lines: Collection[str]) -> None:
+    """Raises ValueError for a servo on a line that there is not, a line without servos, and two servos with one ID on
     one line."""
-    at: dict[tuple[str, int], JointRow] = {}
-    for row in joints:
-        if row.network not in lines:
-            raise ValueError(f"joint {row.name}: there is no network {row.network!r}")
-        if (other := at.setdefault((row.network, row.id), row)) is not row:
-            raise ValueError(f"joint {row.name}: {other.name!r} has the ID {row.id} on network {row.network!r}, too")
+    at: dict[tuple[str, int], ServoPlace] = {}
+    for one in servos:
+        if one.network not in lines:
+            raise ValueError(f"{one.kind} {one.name}: there is no network {one.network!r}")
+        if (other := at.setdefault((one.network, one.id), one)) is not one:
+            says = f"{other.name!r} has the ID {one.id} on network {one.network!r}, too"
+            raise ValueError(f"{one.kind} {one.name}: {says}")
     if idle := sorted(set(lines) - {line for line, _ in at}):
         raise ValueError(f"network {idle[0]}: no joint is on it")
 

@@ -93,6 +93,11 @@ class Odometry:
         self.aside_mps = aside_m / dt_s
         self.turn_rate_radps = turn_rad / dt_s
 
+    def measured(self, wheels_mps: Sequence[float]) -> None:
+        """Take the speeds from the wheels' own measurement: those of `advance` are only as good as the times of two
+        readings."""
+        self.speed_mps, self.turn_rate_radps, self.aside_mps = self._drive.twist(wheels_mps)
+
     # --- a Create's reports -------------------------------------------------------------------------
 
     def unreported(self) -> None:

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, radians, sin, sqrt
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
 from cocoro.drive import Twist, WheelDrive
 from cocoro.units import Positive
@@ -20,6 +22,16 @@ _LEAST_DETERMINANT = 1e-4
 """Of the normal equations of unit rows, by the cube of the number of wheels. Three wheels at 120 degrees have 1/27."""
 
 _Row = tuple[float, float, float]
+
+
+class WheelServo(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The servo that turns a wheel."""
+
+    network: str
+    """The serial line that it is on."""
+    id: Annotated[int, Meta(ge=0, le=253)]
+    direction: Literal[-1, 1] = 1
+    """-1: the wheel drives forwards when the servo's counts fall."""
 
 
 class OmniWheel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -34,6 +46,8 @@ class OmniWheel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     drive_deg: float | None = None
     """Direction in which the wheel drives the body when it turns forwards, counter-clockwise from ahead; by default
     `angle_deg` + 90: all wheels forwards turn the body counter-clockwise."""
+    servo: WheelServo | None = None
+    """None: something else than a servo on one of the robot's lines turns it."""
 
     @property
     def place_m(self) -> tuple[float, float]:

@@ -130,6 +130,11 @@ class Robot:
         """The groups whose joints are on a serial line."""
         return tuple(group for group in GROUPS if self.line_of(group) == line)
 
+    @property
+    def wheel_line(self) -> str | None:
+        """The serial line with the servos that turn the wheels; None where something else turns them."""
+        return next((one.network for one in self.base.servo_places), None)
+
     @cached_property
     def jaws(self) -> tuple[str, ...]:
         """The joints that close the hand."""

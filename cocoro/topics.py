@@ -302,7 +302,7 @@ LEARNED = Request(
 )  # fmt: skip
 RECOVER = Request(
     "base/recover", m.RecoverRequest, m.RecoverReply,
-    "Put a Create that has left its mode back into it; answered by the real base.",
+    "Put a Create that has left its mode back into it, or clear the faults of wheels with servos; by the real base.",
     timeout_s=3.0,
 )  # fmt: skip
 SERVOS = Request(

@@ -25,7 +25,7 @@ from services.kinect.component import KINECT
 from services.perception.component import PERCEPTION
 from services.planning.component import PLANNING
 from services.policy.component import POLICY
-from services.servos.component import SERVOS
+from services.servos.component import SERVOS, SERVOS_BASE
 from sim.component import SIM
 from sim.wire.component import WIRE
 
@@ -35,7 +35,7 @@ SETTLED_S = 30.0
 
 COMPONENTS: tuple[Component, ...] = (
     SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, COCKPIT, WIRE, GATEWAY, PACKER, UNPACKER,
-    POLICY,
+    POLICY, SERVOS_BASE,
 )  # fmt: skip
 """The project's own."""
 

@@ -100,6 +100,9 @@ class MobileBase:
         self.ramp.advance(self._allowed_mps(now_ns), dt_s)
         return self.ramp.wheels_mps
 
+    def strained(self, torques_nm: Sequence[float]) -> None:
+        """Take the torques of the wheels' motors in the step that ended now; `rolled` follows."""
+
     def rolled(self, rolled_m: Sequence[float], now_ns: int, dt_s: float) -> None:
         """Take what the wheels' encoders measured in the step that ended now."""
         if self._exact:

@@ -212,6 +212,7 @@ class World:
         before, self._rolled_m = self._rolled_m, self._rolled(readings)
         # The encoders count turns of the wheel, not the distance that it made with them.
         counted_m = [(now - was) / share for now, was, share in zip(self._rolled_m, before, stretch, strict=True)]
+        self._base.strained([torque_nm for _, _, torque_nm in readings[len(self._servos) :]])
         self._base.rolled(counted_m, now_ns, dt_s)
 
     # --- truth, and what the renderer draws ---------------------------------------------------------

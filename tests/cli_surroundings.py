@@ -59,6 +59,7 @@ ARGUMENTS: dict[str, str] = {
     "cockpit invite": "viewer",
     "cockpit end": "{name}",
     "servos set-id": "1 2 --port {name}",
+    "servos set-wheel": "1 --port {name}",
     "servos calibrate": "elbow",
     "servos import": "{name}",
     "servos limits": "elbow",

@@ -18,8 +18,9 @@ from services.servos.dynamixel import DYNAMIXEL
 from services.servos.families import FAMILIES
 from services.servos.family import ServoFamily, ServoReading
 from services.servos.feetech import FEETECH
-from services.servos.group import MISSES, ServoGroup, ServoStatus, ServoTask
+from services.servos.group import ServoGroup
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
+from services.servos.watch import MISSES, ServoStatus, ServoTask
 
 ROBOT = Robot.load()
 MS = 1_000_000

@@ -14,11 +14,11 @@ from cocoro.joints import Joint
 from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol
 from services.servos.bus import asked, find_status
+from services.servos.cycle import STATE
 from services.servos.dynamixel import DYNAMIXEL, slope_of
 from services.servos.families import FAMILIES
 from services.servos.family import READING_LENGTH, ServoFamily, ServoReading, signed
 from services.servos.feetech import FEETECH
-from services.servos.line import STATE
 
 
 def status(number: int, error: int, data: bytes) -> bytes:

@@ -19,7 +19,7 @@ from cocoro.robot import Robot
 from cocoro.servo_units import UNITS, Protocol
 from cocoro.testing import ServiceUnderTest
 from services.servos.bus import PortError, RefusedWriteError, SilentError
-from services.servos.line import STATE
+from services.servos.cycle import STATE
 from services.servos.motion import LEAD_S, REACH_RAD
 from sim.wire.line import LineFault
 

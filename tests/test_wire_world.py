@@ -111,6 +111,7 @@ def test_wheels_turn_as_the_firmware_asks_and_are_counted(world: World, motors: 
 def test_the_setup_tells_the_firmware_how_the_robot_stands(world: World, motors: WireMotors) -> None:
     setup = setup_of(ROBOT, motors, seed=3)
     create, lines = firmware(setup)
+    assert create is not None
     assert [servo.number for servo in lines["arm"].servos] == [1, 2, 3, 4, 5, 6]
     assert [servo.number for servo in lines["hand"].servos] == [7, 8, 9]
     elbow = lines["arm"].by_number(ELBOW)
@@ -123,6 +124,7 @@ def test_the_setup_tells_the_firmware_how_the_robot_stands(world: World, motors:
 def test_firmware_and_physics_tell_each_other_the_newest_and_notice_the_end() -> None:
     ours, theirs = (Channel(end) for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET))
     create, lines = firmware(Setup(261.0, {"arm": [ServoSetup(5, 28, 5.0, 512)]}, 0))
+    assert create is not None
     body = LinkedPlant(theirs, create, lines)
     create.receive(bytes([128, 131, 145, 0, 100, 0, 50]), 57600, 0)
     for left_m in (0.0, 0.5, 1.0):

@@ -38,7 +38,7 @@ def show_base(
 
 @base.command()
 def recover(robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False) -> None:
-    """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
+    """Put a Create that left its mode back into it; clear the faults of wheels that servos turn."""
     sys.exit(asyncio.run(recover_base(RobotChoice(robot, site), json)))
 
 

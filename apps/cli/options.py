@@ -63,7 +63,8 @@ SiteOption = Annotated[
 ProfileArgument = Annotated[
     str,
     typer.Argument(
-        help="A profile's name (sim, robot, sim-wire, replay) or file.", autocompletion=completions.profiles
+        help="A profile's name (sim, robot, sim-wire, lekiwi-wire, replay) or file.",
+        autocompletion=completions.profiles,
     ),
 ]
 ProfileOption = Annotated[

@@ -58,7 +58,7 @@ def up(
     profile: Annotated[
         str | None,
         typer.Argument(
-            help="A profile's name (sim, robot, sim-wire, replay) or file; sim by default.",
+            help="A profile's name (sim, robot, sim-wire, lekiwi-wire, replay) or file; sim by default.",
             autocompletion=completions.profiles,
         ),
     ] = None,

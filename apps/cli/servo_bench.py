@@ -13,7 +13,7 @@ import typer
 from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import ConfigError, choice_of
-from cocoro.joints import Joint
+from cocoro.joints import Joint, ServoPlace
 from cocoro.ports import port_path
 from cocoro.robot import Robot
 from deploy import profiles
@@ -67,12 +67,19 @@ class ServoWorkbench:
             raise ConfigError(f"there is no joint {name!r}; {choice_of(name, self.robot.joints)}")
         return self.robot.joints[name]
 
-    def owner(self, found: FoundServo) -> Joint | None:
-        """The joint whose servo was found: the only one with its ID, or of several the one whose line has its port."""
-        alike = [joint for joint in self.robot.joints.values() if joint.id == found.number]
+    @property
+    def places(self) -> list[ServoPlace]:
+        """The robot's servos: those of joints, and those of wheels."""
+        joints = [ServoPlace("joint", row.name, row.network, row.id) for row in self.robot.joints.values()]
+        return [*joints, *self.robot.base.servo_places]
+
+    def owner(self, found: FoundServo) -> ServoPlace | None:
+        """What has the servo that was found: the only one with its ID, or of several the one whose line has its
+        port."""
+        alike = [place for place in self.places if place.id == found.number]
         if len(alike) > 1:
-            place = Path(found.port).resolve()
-            alike = [joint for joint in alike if Path(self.ports[joint.network]).resolve() == place]
+            there = Path(found.port).resolve()
+            alike = [place for place in alike if Path(self.ports[place.network]).resolve() == there]
         return alike[0] if len(alike) == 1 else None
 
     @contextmanager

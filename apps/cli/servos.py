@@ -28,7 +28,7 @@ from apps.cli.servo_import import import_lerobot
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
-from cocoro.joints import GROUPS, Group, Joint
+from cocoro.joints import GROUPS, Group, ServoPlace
 from cocoro.messages import ServoReply, ServoRequest
 from cocoro.robot import Robot
 from cocoro.topics import SERVOS
@@ -174,24 +174,24 @@ def scan_ports(
         print(text, file=sys.stderr)
 
     found = list(tools.scan(wanted, bauds or tools.BAUDS, range(1, last + 1), report))
-    owners = {one: joint for one in found if (joint := bench.owner(one)) is not None}
+    owners = {one: place for one in found if (place := bench.owner(one)) is not None}
     if as_json:
         print_json([one._asdict() for one in found])
     else:
         _print_found(found, owners)
-    there = {joint.name for joint in owners.values()}
-    missing = [joint for joint in bench.robot.joints.values() if joint.name not in there]
+    there = set(owners.values())
+    missing = [place for place in bench.places if place not in there]
     if missing and not as_json:
-        print(f"not found: {', '.join(f'{joint.name} (ID {joint.id})' for joint in missing)}")
+        print(f"not found: {', '.join(f'{place.title} (ID {place.id})' for place in missing)}")
     if write is not None:
         _write_ports(bench, owners, write)
     return exits.FAILED if missing else exits.DONE
 
 
-def _print_found(found: list[FoundServo], owners: Mapping[FoundServo, Joint]) -> None:
+def _print_found(found: list[FoundServo], owners: Mapping[FoundServo, ServoPlace]) -> None:
     rows = []
     for one in found:
-        joint = owners[one].name if one in owners else "?"
+        joint = owners[one].title if one in owners else "?"
         errors = ", ".join(one.errors)
         delay = f"{one.return_delay_us} us" if one.return_delay_us else ""
         rows.append(
@@ -202,10 +202,10 @@ def _print_found(found: list[FoundServo], owners: Mapping[FoundServo, Joint]) ->
     print_table(heads, rows) if rows else print("no servo answers")
 
 
-def _write_ports(bench: ServoWorkbench, owners: Mapping[FoundServo, Joint], file: Path) -> None:
+def _write_ports(bench: ServoWorkbench, owners: Mapping[FoundServo, ServoPlace], file: Path) -> None:
     """Writes each line's port into a profile, and what differs of baud rate and protocol into the measured file."""
     for line, row in bench.robot.networks.items():
-        places = {(one.port, one.baud, one.protocol) for one, joint in owners.items() if joint.network == line}
+        places = {(one.port, one.baud, one.protocol) for one, place in owners.items() if place.network == line}
         if not places:
             continue
         if len(places) > 1:
@@ -238,6 +238,23 @@ def set_id(
         tools.set_number(line, old, new)
     data = {"port": port, "id": new, "return_delay_us": 0}
     tell(json, data, f"the servo on {port} has ID {new} and return delay 0")
+
+
+@servos.command("set-wheel")
+def set_wheel(
+    number: Annotated[int, typer.Argument(metavar="ID", min=0, max=253, help="The servo's ID.")],
+    port: Annotated[str, typer.Option(metavar="DEVICE", help="The serial port that it is connected to.")],
+    baud: Annotated[int, typer.Option(metavar="RATE", help="The servo's baud rate.")] = 1_000_000,
+    joint: Annotated[bool, typer.Option("--joint", help="Make it a servo for a joint again.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Set a Feetech servo up as a wheel, which turns endlessly. The robot must be down."""
+    with ServoBus(port, baud, REPLY_S, tries=tools.TRIES) as line:
+        tools.set_wheel(line, number, turns=not joint)
+    what = "goes to goals" if joint else "turns endlessly"
+    tell(
+        json, {"port": port, "id": number, "wheel": not joint}, f"the servo {number} on {port} {what}, and is limp now"
+    )
 
 
 @servos.command()

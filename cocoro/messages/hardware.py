@@ -60,7 +60,7 @@ class PackedFrame(msgspec.Struct, kw_only=True):
 
 
 class BaseState(Message):
-    """The Create: odometry since the service started, its bumpers and its health."""
+    """The base: odometry since the service started, its bumpers and its health."""
 
     odometry_m: FiniteVec2
     """x, y of the body in the odometry frame, whose origin is the body's pose when the service started."""
@@ -86,7 +86,8 @@ class BaseState(Message):
     latch: LatchState = "unknown"
     stopped_by: str = ""
     """Why the base refuses or zeroes wheel commands ('' when it obeys): estop, latch unknown, bump, cliff, wheel drop,
-    overcurrent, no command, mode (the Create left its mode), link."""
+    overcurrent (also: a wheel is held up), no command, mode (the Create left its mode), link (also: a wheel's servo
+    does not answer or does not hold, or the guard is not there)."""
 
     @property
     def standing(self) -> bool:
@@ -152,7 +153,8 @@ class ServoCommand(Message):
 
 
 class RecoverRequest(msgspec.Struct, kw_only=True):
-    """Restores the mode of a Create that left it by itself (at a cliff, a wheel drop, the charger)."""
+    """Restores the mode of a Create that left it by itself (at a cliff, a wheel drop, the charger), or clears the
+    faults of wheels that servos turn."""
 
 
 class RecoverReply(msgspec.Struct, kw_only=True):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import msgspec
 
 from cocoro.base import Base
-from cocoro.clock import NS, is_fresh
+from cocoro.clock import NS
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import Odometry, WheelRamp
-from cocoro.topics import BASE_COMMAND
+from cocoro.wheel_commands import WheelCommands
 from services.base import oi
 from services.base.guard_logic import LinkState
 
@@ -45,16 +45,11 @@ class BaseDriver:
     """Every `now_ns` is the robot's clock."""
 
     def __init__(self, base: Base) -> None:
-        self.latch: LatchState = "unknown"
         self.link: LinkState = "closed"
         self.why = "the guard has not reported yet"
-        self._base = base
-        self._timeout_ns = round(base.command_timeout_s * NS)
-        self._drive = base.drive
-        self._odometry = Odometry(self._drive)
+        self._commands = WheelCommands(base)
+        self._odometry = Odometry(base.drive)
         self._ramp = WheelRamp(base)
-        self._wanted_mmps = (0, 0)
-        self._until_ns = -1
         self._readings: oi.Readings = {}
         self._frame_ns: int | None = None
         self._damage = 0
@@ -63,37 +58,27 @@ class BaseDriver:
 
     # --- commands -----------------------------------------------------------------------------------
 
+    @property
+    def latch(self) -> LatchState:
+        return self._commands.latch
+
     def command(self, command: BaseCommand, now_ns: int) -> None:
-        """Accept speeds, but none aside: such a command is not obeyed, and the one before it expires. They expire
-        `Base.patience_s` after the command's stamp, the sooner the faster."""
-        if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
-            return
-        try:
-            wheels_mps = self._drive.wheels_of(command)
-        except ValueError:  # what it cannot do
-            return
-        limit_mmps = self._base.max_wheel_speed_mps * 1000.0
-        left, right = (round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps)) for speed_mps in wheels_mps)
-        self._wanted_mmps = left, right
-        patience_s = self._base.patience_s(max(abs(left), abs(right)) / 1000.0)
-        self._until_ns = min(command.stamp_ns, now_ns) + round(patience_s * NS)
+        """See `WheelCommands.command`."""
+        self._commands.command(command, now_ns)
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown stop the wheels; a release does not revive an earlier command. Thread-safe."""
-        self.latch = state
-        self._until_ns = -1
+        """See `WheelCommands.set_latch`. Thread-safe."""
+        self._commands.set_latch(state)
 
     def new_epoch(self) -> None:
         """The clock restarted: earlier commands and frames belong to no time of the new epoch."""
-        self._until_ns = -1
+        self._commands.new_epoch()
         self._frame_ns = None
 
     def wheels(self, now_ns: int) -> tuple[int, int, int]:
         """Left and right speed to ask the guard for, mm/s, and for how long from now, ns."""
-        left_ns = self._until_ns - now_ns
-        if self.latch != "released" or left_ns < 0:
-            return 0, 0, self._timeout_ns
-        return *self._wanted_mmps, min(left_ns, self._timeout_ns)
+        (left_mps, right_mps), for_ns = self._commands.wheels(now_ns)
+        return round(left_mps * 1000.0), round(right_mps * 1000.0), for_ns
 
     # --- reports ------------------------------------------------------------------------------------
 
@@ -166,13 +151,9 @@ class BaseDriver:
         return min(self._readings[oi.CHARGE] / capacity, 1.0) if capacity else 0.0
 
     def stopped_by(self, now_ns: int) -> str:
-        if self.latch != "released":
-            return STOPPED_BY[self.latch]
-        if self.link != "up":
-            return "mode" if self.link == "fallen" else "link"
-        if now_ns > self._until_ns:
-            return "no command"
-        return self.why
+        if (latched := STOPPED_BY[self.latch]) or self.link == "up":
+            return latched or self._commands.stopped_by(now_ns) or self.why
+        return "mode" if self.link == "fallen" else "link"
 
     def faults(self) -> tuple[str, ...]:
         """The base's faults, for people, most fundamental first."""

@@ -16,37 +16,32 @@ turn. It forwards the wheel speeds that the service asks for, and stops the whee
 `--fd` is its end of a SOCK_SEQPACKET pair. It receives {"left": mm/s, "right": mm/s, "until": ns, "reset": number of
 emergency stops that have been reset} and {"recover": true}. It sends a report for each frame, and 20 a second without
 frames (`GuardReport` in `services.base.driver`). Times are CLOCK_MONOTONIC, which all processes of a machine share. It
-imports only the standard library, this project's stop path and pyserial.
+imports only the standard library, this project's stop path and pyserial (`cocoro.guard_process`).
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
-import fcntl
-import json
 import os
 import select
-import signal
 import socket
 import sys
 import termios
 import time
 from contextlib import suppress
+from typing import Any
 
 import serial
 
-from cocoro.stop.path import Asked, StopPoint
+from cocoro.guard_process import QUIET_NS, TURN_S, GuardProcess, add_arguments, run
+from cocoro.stop.path import StopPoint
 from services.base import oi
 from services.base.guard_logic import MS, GuardLogic
 
-TURN_S = 0.005
-"""Longest sleep between two looks at the clock."""
-QUIET_NS = 50 * MS
 REOPEN_NS = 200 * MS
 STOPPING_NS = 1000 * MS
 """Upper bound for the time in which it waits for the wheels to stand before it ends."""
-PRIORITY = 20
 SENTENCES = {
     errno.ENOENT: "there is no such port: is the adapter plugged in?",
     errno.EACCES: "no permission: add the user to the group dialout, and log in again",
@@ -56,14 +51,13 @@ SENTENCES = {
 }
 
 
-class Guard:
+class Guard(GuardProcess):
     """Runs one port by one `GuardLogic`."""
 
     def __init__(self, path: str, logic: GuardLogic, channel: socket.socket, point: StopPoint | None = None) -> None:
+        super().__init__(channel, point)
         self._path = path
         self._logic = logic
-        self._channel = channel
-        self._point = point
         self._port: serial.Serial | None = None
         self._why = "not opened yet"
         self._reported_ns = 0
@@ -76,7 +70,7 @@ class Guard:
         descriptors = [one for one in (self._channel, self._port, self._point) if one is not None]
         readable, _, _ = select.select(descriptors, [], [], TURN_S)
         stops = self._take_stops() if self._point in readable else []
-        if self._channel in readable and not self._take_commands():
+        if self._channel in readable and not self._take_messages():
             return False
         now_ns = time.monotonic_ns()
         if self._port is not None:
@@ -144,46 +138,16 @@ class Guard:
             with suppress(BlockingIOError):
                 os.write(port.fileno(), data)
 
-    def _take_stops(self) -> list[Asked]:
-        """Receive stop requests, at most 16 per turn, so that a flood of them does not delay the port."""
-        assert self._point is not None
-        stops: list[Asked] = []
-        while len(stops) < 16 and (asked := self._point.take(wait=False)) is not None:
-            self._logic.stop()
-            stops.append(asked)
-        return stops
+    def _stopped(self) -> None:
+        self._logic.stop()
 
-    def _answer(self, asked: Asked, at_ns: int) -> None:
-        """Acknowledge a stop request. The guard keeps no record on disk: the base service does."""
-        assert self._point is not None
-        self._point.latched(asked, at_ns)
-        self._point.keeps_nothing(asked)
-
-    def _take_commands(self) -> bool:
-        """False when the other end is closed."""
-        for _ in range(16):
-            try:
-                message = self._channel.recv(4096)
-            except BlockingIOError:
-                return True
-            except ConnectionError:
-                return False
-            if not message:
-                return False
-            self._obey(message)
-        return True
-
-    def _obey(self, message: bytes) -> None:
+    def _obey(self, message: dict[str, Any]) -> None:
         now_ns = time.monotonic_ns()
-        try:
-            command = json.loads(message)
-            if "until" in command:
-                self._logic.reset(int(command.get("reset", 0)))
-                self._logic.ask(int(command["left"]), int(command["right"]), int(command["until"]), now_ns)
-            elif command.get("recover"):
-                self._logic.recover(now_ns)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
-            return  # a malformed command is ignored
+        if "until" in message:
+            self._logic.reset(int(message.get("reset", 0)))
+            self._logic.ask(int(message["left"]), int(message["right"]), int(message["until"]), now_ns)
+        elif message.get("recover"):
+            self._logic.recover(now_ns)
 
     def _report(self, now_ns: int, readings: oi.Readings | None = None) -> None:
         self._reported_ns = now_ns
@@ -199,8 +163,7 @@ class Guard:
             "readings": readings,
             "counts_lost": self._logic.take_counts_lost() if readings is not None else False,
         }
-        with suppress(BlockingIOError, ConnectionError):
-            self._channel.send(json.dumps(report).encode())
+        self._send(report)
 
 
 def _sentence(error: Exception, path: str) -> str:
@@ -211,29 +174,15 @@ def _sentence(error: Exception, path: str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m services.base.guard", description="Own a Create's serial port.")
-    parser.add_argument("port")
-    parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
-    parser.add_argument("--robot", help="name of the robot whose emergency stop to obey; none by default")
+    add_arguments(parser)
     parser.add_argument("--mode", choices=("safe", "full"), default="safe")
     parser.add_argument("--deadman-ms", type=int, default=200)
     options = parser.parse_args()
 
-    signals: list[int] = []
-    signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service, which closes the socket
-    with suppress(OSError):  # the permission is LimitRTPRIO in the unit file
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    channel = socket.socket(fileno=options.fd)
-    channel.setblocking(False)
-    fcntl.fcntl(channel, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
-    point = StopPoint(options.robot, "wheels") if options.robot else None
-    guard = Guard(options.port, GuardLogic(options.mode, options.deadman_ms * MS), channel, point)
-    try:
-        while not signals and guard.turn():
-            pass
-    finally:
-        guard.stop()
-    return 0
+    def make(channel: socket.socket, point: StopPoint | None) -> Guard:
+        return Guard(options.port, GuardLogic(options.mode, options.deadman_ms * MS), channel, point)
+
+    return run(options, make)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,9 @@ class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BaseService:
     def __init__(self, node: Node, config: BaseConfig) -> None:
         if node.robot.base.kind != "differential":
-            raise ConfigError(f"a Create has two wheels on one axle, but [base] kind = {node.robot.base.kind!r}")
+            hint = "" if node.robot.wheel_line is None else "; the process for wheels with servos is servos-base"
+            kind = node.robot.base.kind
+            raise ConfigError(f"a Create has two wheels on one axle, but [base] kind = {kind!r}{hint}")
         self._node = node
         self._reporter = FaultReporter(node)
         self._driver = BaseDriver(node.robot.base)

@@ -183,14 +183,23 @@ class ServoBus:
     """A context manager. Every method raises PortError when the line fails; the bus is unusable afterwards."""
 
     def __init__(
-        self, path: str, baud: int, timeout_s: float = REPLY_S, family: ServoFamily = DYNAMIXEL, tries: int = 1
+        self,
+        path: str,
+        baud: int,
+        timeout_s: float = REPLY_S,
+        family: ServoFamily = DYNAMIXEL,
+        tries: int = 1,
+        port: CheckedPort | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`tries`: how often a servo that does not answer is asked. A service asks once, since its next period comes
-        soon; a tool asks again, since one lost packet shall not end what a person has begun."""
+        soon; a tool asks again, since one lost packet shall not end what a person has begun. `port` and `clock_ns`
+        replace the serial port at `path` and the clock of readings."""
         self.path = path
         self._tries = tries
+        self._clock_ns = clock_ns
         self._sdk = Protocol1PacketHandler()
-        self._port = CheckedPort(path, baud, timeout_s)
+        self._port = port or CheckedPort(path, baud, timeout_s)
         self.family = family
         try:
             self._port.openPort()
@@ -256,7 +265,7 @@ class ServoBus:
 
     def _reading(self, number: int) -> ServoReading:
         data, error = self._block(number, self.family.registers["present_position"].address, READING_LENGTH)
-        found = self.family.reading(data, error, time.monotonic_ns()) if len(data) == READING_LENGTH else None
+        found = self.family.reading(data, error, self._clock_ns()) if len(data) == READING_LENGTH else None
         if found is None:
             raise SilentError(number)
         return found
@@ -312,9 +321,16 @@ class ServoBus:
         if not orders:
             return
         address, length = self.family.block(self.family.orders[0], self.family.orders[-1])
-        data: list[int] = []
-        for number, (goal, speed) in orders.items():
-            data += [number, *self.family.order(goal, speed)]
+        values = {number: self.family.order(goal, speed) for number, (goal, speed) in orders.items()}
+        self._write_all(address, length, values)
+
+    def spin(self, speeds: Mapping[int, int]) -> None:
+        """Write the speeds (counts, with their signs) of several wheels by one sync write, which is not answered."""
+        row = self.family.registers["moving_speed"]
+        self._write_all(row.address, row.size, {number: self.family.spin(speed) for number, speed in speeds.items()})
+
+    def _write_all(self, address: int, length: int, values: Mapping[int, bytes]) -> None:
+        data = [byte for number, value in values.items() for byte in (number, *value)]
         try:
             self._sdk.syncWriteTxOnly(self._port, address, length, data, len(data))
         except OSError as fault:

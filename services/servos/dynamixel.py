@@ -70,6 +70,7 @@ DYNAMIXEL = ServoFamily(
     modes=("low_limit", "high_limit"),
     is_wheel=lambda limits: not any(limits),
     signs=Signs(position=(1 << 16, 1023), speed=(SIGN, 1023), load=(SIGN, 1023)),
+    wheel_settings={},
     volts=(9.0, 16.0),
     errors={
         VOLTAGE: "voltage",

@@ -68,6 +68,8 @@ class ServoFamily:
     is_wheel: Callable[[bytes], bool]
     """Whether a servo with these values turns endlessly instead of going to a goal."""
     signs: Signs
+    wheel_settings: Mapping[str, int]
+    """The registers that are written before the servo of a wheel is enabled."""
     volts: tuple[float, float]
     """The voltages of a supply that is well."""
     errors: Mapping[int, str]
@@ -94,6 +96,11 @@ class ServoFamily:
         """The values of `orders` for goal and speed, counts."""
         values = {"goal_position": goal, "moving_speed": speed}
         return b"".join(values.get(name, 0).to_bytes(self.registers[name].size, "little") for name in self.orders)
+
+    def spin(self, speed: int) -> bytes:
+        """The value of `moving_speed` for a wheel's speed, counts with a sign."""
+        sign, _ = self.signs.speed
+        return (min(abs(speed), sign - 1) | (sign if speed < 0 else 0)).to_bytes(2, "little")
 
     def reading(self, data: bytes, error: int, at_ns: int) -> ServoReading | None:
         """Decode the eight bytes from the present position on; None when a servo cannot measure such values."""

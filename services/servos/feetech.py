@@ -8,12 +8,15 @@ from a Dynamixel in what a driver must know:
 - There is no compliance: the gains of its loop, which are in its kept memory, stay as they are.
 - After an overload (by default 2 s above 80 % of its torque) it pushes with 20 % and says so, although its torque is
   still enabled and its limit the same. The manuals leave open what ends this. To switch the torque off and on does.
-- A servo in mode 1 is a wheel: it turns at its speed for ever, in place of going to its goal at that speed.
+- A servo in mode 1 is a wheel: it turns at its speed for ever, in place of going to its goal at that speed. The speed
+  has its sign in bit 15 and counts steps per second, 4096 a turn. Its position goes on from 4095 to 0. No register ends
+  that when nothing is heard any more: the table has no time limit of the communication.
 """
 
 from __future__ import annotations
 
 from cocoro.joints import Joint
+from cocoro.servo_units import UNITS
 from services.servos.family import Register, ServoFamily, Signs, kept
 
 REGISTERS: dict[str, Register] = {
@@ -79,6 +82,7 @@ FEETECH = ServoFamily(
     modes=("mode",),
     is_wheel=any,
     signs=Signs(position=(1 << 15, 32767), speed=(1 << 15, FAST_STEPS), load=(1 << 10, 1023)),
+    wheel_settings={"acceleration": ACCELERATION, "torque_limit": UNITS["feetech"].full_torque},
     volts=(4.0, 14.0),  # of all variants: one for 7.4 V cannot be told from one for 12 V
     errors={
         VOLTAGE: "voltage",

@@ -124,6 +124,18 @@ def set_number(bus: ServoBus, old: int, new: int) -> None:
     bus.keep(new, "return_delay", 0)
 
 
+def set_wheel(bus: ServoBus, number: int, *, turns: bool) -> None:
+    """Set a servo up as a wheel, which turns endlessly, or as a joint again; it is limp afterwards. Raises RefusedError
+    when no servo answers as that number, and for a servo of a family that is not driven as a wheel."""
+    if not recognise(bus, number):
+        raise RefusedError(f"no servo answers as {number}: is it powered, and at this baud rate?")
+    if "mode" not in bus.family.registers:
+        raise RefusedError(f"servo {number} speaks {bus.family.protocol}: only Feetech servos are driven as wheels")
+    bus.write(number, "torque_enable", 0)
+    bus.write(number, "moving_speed", 0)
+    bus.keep(number, "mode", int(turns))
+
+
 def relax(bus: ServoBus, joint: Joint) -> None:
     try:
         bus.write(joint.id, "torque_enable", 0)

@@ -1,8 +1,7 @@
 """Emulates a Create and a Calliope's servos without physics, until Ctrl-C: `python -m sim.wire DIR`.
 
-For first steps with the tools. It makes in DIR the port `create` and one for each of the robot's lines (`arm`
-and `hand`), and the socket `control` (see
-`sim.wire.control`).
+For first steps with the tools. It makes in DIR one port for each of the robot's lines (a Calliope's `arm` and `hand`),
+the port `create` if it stands on one, and the socket `control` (see `sim.wire.control`).
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from sim.wire.control import Control, ControlServer
 from sim.wire.create import EmulatedCreate
-from sim.wire.emulator import Emulator, SimplePlant
-from sim.wire.models import model_of, servo_of, servos_on_lines
+from sim.wire.emulator import Device, Emulator, SimplePlant
+from sim.wire.models import model_of, servo_of, servos_on_lines, wheel_of
 from sim.wire.servo import EmulatedServoBus
 
 
@@ -31,17 +30,22 @@ def main() -> int:
     options = parser.parse_args()
     folder: Path = options.folder
     try:
-        lines = servos_on_lines(Robot.load(options.description, options.measured))
+        robot = Robot.load(options.description, options.measured)
+        lines = servos_on_lines(robot)
     except ConfigError as error:
         parser.error(str(error))
-    create = EmulatedCreate()
+    create = EmulatedCreate() if robot.base.kind == "differential" else None
     buses = {
         line: EmulatedServoBus(
-            servo_of(model_of(joint.group, protocol), joint.id, joint.overload_s) for joint in joints
+            [
+                *(servo_of(model_of(joint.group, protocol), joint.id, joint.overload_s) for joint in joints),
+                *(wheel_of(place, protocol) for place in robot.base.servo_places if place.network == line),
+            ]
         )
         for line, (protocol, joints) in lines.items()
     }
-    emulator = Emulator(folder, {"create": create, **buses}, SimplePlant(create, *buses.values()))
+    devices: dict[str, Device] = {**({} if create is None else {"create": create}), **buses}
+    emulator = Emulator(folder, devices, SimplePlant(create, *buses.values()))
     with ControlServer(folder, Control(emulator)), suppress(KeyboardInterrupt):
         print("\n".join(str(folder / name) for name in emulator.lines), flush=True)
         emulator.run()

@@ -145,6 +145,9 @@ class Control:
             create = self._create
             state["create"] = {"mode": create.mode, "wheels": create.wheels_mmps, "acted": list(create.acted)}
             create.acted.clear()
+        state["wheels"] = {
+            servo.number: servo.motor.endless for servo in self._servos if servo.motor.endless is not None
+        }
         state["servos"] = {servo.number: servo.looks for servo in self._servos}
         for servo in self._servos:
             servo.acted.clear()

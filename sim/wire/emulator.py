@@ -18,7 +18,7 @@ from typing import Protocol, TypeVar
 from cocoro.clock import NS
 from sim.wire.create import EmulatedCreate
 from sim.wire.line import Disturbance, LineFault, PseudoSerialPort
-from sim.wire.servo import EmulatedServo, EmulatedServoBus
+from sim.wire.servo import EmulatedServo, EmulatedServoBus, Motor
 
 T = TypeVar("T")
 
@@ -189,6 +189,10 @@ class SimplePlant:
             if servo.number == number and not servo.motor.on:
                 shaft.count = float(count)
 
+    def speeds(self) -> dict[int, float]:
+        """By the ID of a servo that turns endlessly, its speed, the family's unit."""
+        return {servo.number: shaft.speed for servo, shaft in self._shafts}
+
     def fileno(self) -> int:
         return -1
 
@@ -216,10 +220,15 @@ class _Shaft:
         self._counts_a_speed = servo.SPEED_RPM / 60 * servo.TURN_COUNTS
         """Position counts per second for each count of speed."""
         self.count = float(servo.shaft)
+        self.speed = 0.0
+        """Of a servo that turns endlessly."""
 
     def turn(self, dt_s: float, blocked: bool, now_ns: int) -> None:
         motor = self._servo.motor
-        speed = load = 0.0
+        if motor.endless is not None:
+            self._spin(motor, motor.endless, dt_s, blocked, now_ns)
+            return
+        self.speed = speed = load = 0.0
         error = motor.goal - self.count
         if motor.on and motor.limit > 0.0 and abs(error) >= 0.5:
             share = min(max(abs(error) / motor.slope, motor.punch), 1.0)
@@ -230,3 +239,14 @@ class _Shaft:
                 speed = copysign(step / self._counts_a_speed / dt_s, error)
                 self.count += copysign(step, error)
         self._servo.sense(round(self.count), round(speed), load, now_ns)
+
+    def _spin(self, motor: Motor, wanted: int, dt_s: float, blocked: bool, now_ns: int) -> None:
+        """Turn endlessly. One that is limp is braked by its gears, as fast as any."""
+        pushes = motor.on and motor.limit > 0.0
+        asked = min(max(wanted, -self._full_speed), self._full_speed) if pushes else 0.0
+        change = asked - self.speed
+        step = motor.acceleration * dt_s if motor.acceleration else abs(change)
+        self.speed = 0.0 if blocked else self.speed + copysign(min(abs(change), step), change)
+        self.count += self.speed * self._counts_a_speed * dt_s
+        load = copysign(motor.limit if blocked else 0.05 * motor.limit, asked) if pushes and asked else 0.0
+        self._servo.sense(round(self.count), round(self.speed), load, now_ns)

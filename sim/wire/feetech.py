@@ -23,6 +23,8 @@ CENTRE_HERE = 128
 """Written into the torque switch, it makes the present position 2048."""
 WHEEL = 1
 """The mode in which it turns at its speed for ever."""
+ACCELERATION_STEPS = 100
+"""Unit of register 41, steps/s^2; 0 is no limit."""
 FULL_PUSH = 80
 """Steps from the goal at which it pushes with all its torque, by the factory's gains (about; derived from reports)."""
 
@@ -71,6 +73,10 @@ class EmulatedFeetech(EmulatedServo):
         super().power_up()
         self.stand((shaft - self._offset) % TURN)
 
+    def be_wheel(self) -> None:
+        self.put(33, WHEEL)
+        self._saved = bytes(self._cells[: self.ROM_END])
+
     def stand(self, position: int) -> None:
         self._shaft = position + self._offset
         super().stand(position)
@@ -97,10 +103,20 @@ class EmulatedFeetech(EmulatedServo):
         low, high = self.get(9), self.get(11)
         goal = _value(self.get(42), 15)
         goal = self._offset + (min(max(goal, low), high) if low < high else goal)
-        if self.get(33) == WHEEL:
+        is_wheel = self.get(33) == WHEEL
+        if is_wheel:
             goal = self._shaft + (round(copysign(TURN, speed)) if speed else 0)
         on = self.get(40) == 1 and self.powered and not error & unload & (OVERHEATING | CURRENT)
-        return Motor(on, goal, abs(speed), limit, slope=FULL_PUSH, punch=self.get(24) / 1000)
+        return Motor(
+            on,
+            goal,
+            abs(speed),
+            limit,
+            slope=FULL_PUSH,
+            punch=self.get(24) / 1000,
+            endless=speed if is_wheel else None,
+            acceleration=ACCELERATION_STEPS * self.get(41),
+        )
 
     def sense(self, shaft: int, speed: int, load: float, now_ns: int) -> None:
         self._shaft = shaft

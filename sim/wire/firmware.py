@@ -35,12 +35,15 @@ class ServoSetup(msgspec.Struct, array_like=True):
     model: int
     overload_s: float
     position: int
+    is_wheel: bool = False
+    """Whether it is set up to turn endlessly."""
 
 
 class Setup(msgspec.Struct, array_like=True):
     """The first datagram to the firmware: its devices and their state."""
 
-    wheel_base_mm: float
+    wheel_base_mm: float | None
+    """Of the Create; None for a robot without one."""
     lines: dict[str, list[ServoSetup]]
     seed: int
 
@@ -54,6 +57,8 @@ class MotorOrder(msgspec.Struct, array_like=True):
     limit: float
     slope: int
     punch: float
+    endless: int | None = None
+    acceleration: int = 0
 
 
 class MotorOrders(msgspec.Struct, array_like=True):
@@ -116,7 +121,7 @@ class Channel:
 class LinkedPlant:
     """The firmware's plant: its mechanics are simulated by the physics in the other process."""
 
-    def __init__(self, channel: Channel, create: EmulatedCreate, lines: Mapping[str, EmulatedServoBus]) -> None:
+    def __init__(self, channel: Channel, create: EmulatedCreate | None, lines: Mapping[str, EmulatedServoBus]) -> None:
         self._channel = channel
         self._create = create
         self._servos = {servo.number: servo for bus in lines.values() for servo in bus.servos}
@@ -140,37 +145,46 @@ class LinkedPlant:
             self._channel.send(orders)
 
     def _sense(self, state: PlantState) -> None:
-        rolled_m = state.left_m, state.right_m
-        before_m = self._rolled_m or rolled_m
-        self._rolled_m = rolled_m
-        self._create.roll(rolled_m[0] - before_m[0], rolled_m[1] - before_m[1])
-        self._create.sensors.bump_left = state.bump_left
-        self._create.sensors.bump_right = state.bump_right
+        if self._create is not None:
+            self._roll(self._create, state)
         for number, shaft in state.shafts.items():
             self._servos[number].sense(*shaft, state.time_ns)
 
+    def _roll(self, create: EmulatedCreate, state: PlantState) -> None:
+        rolled_m = state.left_m, state.right_m
+        before_m = self._rolled_m or rolled_m
+        self._rolled_m = rolled_m
+        create.roll(rolled_m[0] - before_m[0], rolled_m[1] - before_m[1])
+        create.sensors.bump_left = state.bump_left
+        create.sensors.bump_right = state.bump_right
+
     def _orders(self) -> MotorOrders:
-        left, right = self._create.wheels_mmps
-        motors = {number: _order(servo.motor) for number, servo in self._servos.items()}
+        left, right = (0, 0) if self._create is None else self._create.wheels_mmps
+        motors = {number: order_of(servo.motor) for number, servo in self._servos.items()}
         return MotorOrders(left, right, motors)
 
 
-def _order(motor: Motor) -> MotorOrder:
-    return MotorOrder(motor.on, motor.goal, motor.speed, motor.limit, motor.slope, motor.punch)
+def order_of(motor: Motor) -> MotorOrder:
+    return MotorOrder(
+        motor.on, motor.goal, motor.speed, motor.limit, motor.slope, motor.punch, motor.endless, motor.acceleration
+    )
 
 
-def firmware(setup: Setup) -> tuple[EmulatedCreate, dict[str, EmulatedServoBus]]:
-    """Make the devices of a setup: the Create is off, the servos hold their positions."""
+def firmware(setup: Setup) -> tuple[EmulatedCreate | None, dict[str, EmulatedServoBus]]:
+    """Make the devices of a setup: the Create, if there is one, is off, the servos hold their positions, and those of
+    wheels are limp."""
     lines = {}
     for name, rows in setup.lines.items():
         servos = []
         for row in rows:
             servo = servo_of(row.model, row.number, row.overload_s)
             servo.stand(row.position)
-            servo.put(servo.AT.torque, 1)
+            servo.put(servo.AT.torque, int(not row.is_wheel))
+            if row.is_wheel:
+                servo.be_wheel()
             servos.append(servo)
         lines[name] = EmulatedServoBus(servos)
-    return EmulatedCreate(setup.wheel_base_mm), lines
+    return None if setup.wheel_base_mm is None else EmulatedCreate(setup.wheel_base_mm), lines
 
 
 PREFERRED = -10
@@ -199,7 +213,7 @@ def main() -> int:
     if setup is None:
         return 1
     create, lines = firmware(setup)
-    devices: dict[str, Device] = {"create": create, **lines}
+    devices: dict[str, Device] = {**({} if create is None else {"create": create}), **lines}
     plant = LinkedPlant(channel, create, lines)
     emulator = _Ending(options.folder, devices, plant, setup.seed)
     emulator.linked = plant

@@ -65,6 +65,10 @@ class Motor:
     slope: int
     """Distance from the goal, counts, below which it pushes with less than its limit."""
     punch: float
+    endless: int | None = None
+    """Speed, counts of the family's unit with a sign, of a servo that turns endlessly; None: it goes to its goal."""
+    acceleration: int = 0
+    """How fast that speed changes, the family's unit per second; 0: at once."""
 
 
 class EmulatedServo(ABC):
@@ -119,6 +123,10 @@ class EmulatedServo(ABC):
         self.put(at.limit, self.get(at.max_torque))
         self._tripped = 0
         self._straining_ns = None
+
+    def be_wheel(self) -> None:
+        """Set it up to turn endlessly, as its owner did before. Raises ValueError when no such setup is emulated."""
+        raise ValueError(f"a servo of model {self._model} is not emulated as a wheel")
 
     def stand(self, position: int) -> None:
         """Set the position that it measures, counts; its goal is the same."""
