@@ -17,9 +17,9 @@ import numpy as np
 
 from apps.captures.export import lerobot
 from bench.policy_data import Episode, episodes_of, layout_of
-from bench.policy_learned import Look, Network, write
+from bench.policy_learned import Look, Network
 from bench.policy_scenes import LABEL, Case, all_rehearsed, judged
-from bench.policy_training import begun, pairs_of, train
+from bench.policy_training import begun, pairs_of, train, write
 from bench.report import Report
 from bench.trials import Runs, add_frames, add_jobs, number_of, sized
 from cocoro.errors import CocoroError

@@ -1,8 +1,8 @@
 """A policy that was learned by imitation, as the service `policy` runs it: what it looks at, and its network.
 
-It is a file of weights (NumPy's .npz) and a module beside it that names this class: see `write`. What the network gets
-of a picture is where the red in it is, and how much; of the state, the joint angles. It gets no speeds: one that does
-learns to go on as it goes.
+A copy of this file lies beside the weights (NumPy's .npz) of each policy that the bench writes, with a callable that
+reads them: so it needs nothing of the bench. What the network gets of a picture is where the red in it is, and how
+much; of the state, the joint angles. It gets no speeds: one that does learns to go on as it goes.
 """
 
 from __future__ import annotations
@@ -121,23 +121,3 @@ class Learned:
         inputs = self._look(observation[STATE], observation[PICTURES])
         rows: FloatArray = self._network(inputs[None])[0].reshape(self.features.chunk, -1)
         return rows
-
-
-def write(folder: Path, name: str, network: Network, features: PolicyFeatures) -> str:
-    """Write a policy into a folder, as NAME.npz and NAME.py. Returns what a task names it by."""
-    arrays = {
-        **{f"weights_{number}": values for number, values in enumerate(network.weights)},
-        **{f"biases_{number}": values for number, values in enumerate(network.biases)},
-        **{field: getattr(network, field) for field in Network._fields[2:]},
-    }
-    said = {field: getattr(features, field) for field in ("rate_hz", "chunk", "every", "width", "height", "robot")}
-    np.savez(folder / f"{name}.npz", layers=len(network.weights), names=np.array(features.state), **said, **arrays)
-    program = folder / f"{name}.py"
-    program.write_text(
-        '"""A learned policy."""\n\nfrom pathlib import Path\n\nfrom bench.policy_learned import Learned\n'
-        "from cocoro.robot import Robot\n\n\n"
-        f"def {name}(robot: Robot) -> Learned:\n"
-        f'    return Learned(robot, Path(__file__).with_suffix(".npz"))\n',
-        encoding="utf-8",
-    )
-    return f"{program}:{name}"

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench import policy_learned
 from bench.policy_data import Episode
 from bench.policy_learned import Network
 from cocoro.arrays import FloatArray
+from cocoro.features import PolicyFeatures
 
 STEP, FIRST_DECAY, SECOND_DECAY = 2e-3, 0.9, 0.999
 """Of Adam (Kingma and Ba 2015), with the two decays that it proposes; the step falls to zero as a half cosine."""
@@ -100,3 +103,26 @@ def _slopes(network: Network, inputs: FloatArray, wanted: FloatArray) -> list[Fl
         if number:
             back = (back @ network.weights[number].T) * (1.0 - outputs[number] ** 2)
     return [*by_weights, *by_biases]
+
+
+def write(folder: Path, name: str, network: Network, features: PolicyFeatures) -> str:
+    """Write a policy into a folder, as NAME.npz and NAME.py. Returns what a task names it by."""
+    layers = {
+        f"{kind}_{number}": values
+        for kind in ("weights", "biases")
+        for number, values in enumerate(getattr(network, kind))
+    }
+    scales = {field: getattr(network, field) for field in Network._fields[2:]}
+    said = {field: getattr(features, field) for field in ("rate_hz", "chunk", "every", "width", "height", "robot")}
+    kept: dict[str, Any] = {
+        "layers": len(network.weights),
+        "names": np.array(features.state),
+        **said,
+        **layers,
+        **scales,
+    }
+    np.savez(folder / f"{name}.npz", **kept)
+    program = folder / f"{name}.py"
+    make = f'def {name}(robot: Robot) -> Learned:\n    return Learned(robot, Path(__file__).with_suffix(".npz"))\n'
+    program.write_text(f"{Path(policy_learned.__file__).read_text(encoding='utf-8')}\n\n{make}", encoding="utf-8")
+    return f"{program}:{name}"

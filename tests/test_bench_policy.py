@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from apps.captures.export.lerobot_episodes import Episode as Recorded
 from apps.captures.export.lerobot_episodes import RecordedTask
 from apps.captures.export.lerobot_files import Dataset, Shape
 from bench.policy_data import Episode, episodes_of, layout_of
-from bench.policy_learned import SEEN_NOISE, Look, write
+from bench.policy_learned import SEEN_NOISE, Look
 from bench.policy_scenes import scene_text
-from bench.policy_training import begun, error, pairs_of, train
+from bench.policy_training import begun, error, pairs_of, train, write
 from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.features import PICTURES, STATE, PolicyFeatures, names_of
 from cocoro.robot import Robot
@@ -97,6 +98,7 @@ def test_the_policy_that_is_written_proposes_what_the_trained_network_does(tmp_p
         state=NAMES, action=NAMES, rate_hz=10.0, chunk=CHUNK, every=2, width=WIDTH, height=HEIGHT, robot=ROBOT.name
     )
     source = write(tmp_path, "learned", network, features)
+    assert not re.search(r"^(from|import) bench", (tmp_path / "learned.py").read_text(), re.MULTILINE)
     policy = Policies(ROBOT, PolicyServiceConfig(anything=True)).load(source)
     assert policy.features == features
     state, shown = looking(-0.5), picture(70, 40)
