@@ -18,7 +18,7 @@ import numpy as np
 from apps.captures.export import lerobot
 from bench.policy_data import Episode, episodes_of, layout_of
 from bench.policy_learned import Look, Network
-from bench.policy_scenes import LABEL, Case, all_rehearsed, judged
+from bench.policy_scenes import LABEL, Case, Judged, all_rehearsed, judged
 from bench.policy_training import begun, pairs_of, train, write
 from bench.report import Report
 from bench.trials import Runs, add_frames, add_jobs, number_of, sized
@@ -75,6 +75,17 @@ def _record(chosen: argparse.Namespace, place: Path, report: Report) -> None:
     for case, result in all_rehearsed(cases, chosen.jobs):
         report.say(f"{case.record.name}: {result['outcome']} {result['reason']} {result['sim_s']:.1f} s")
     report.value("recording, wall time", [time.perf_counter() - began_s], "s")
+    robot = Robot.load()
+    _compare("the planner's fetches", [judged(robot, case) for case in cases], report)
+
+
+def _compare(whose: str, runs: list[Judged], report: Report) -> None:
+    """Figures of the good runs of planner or policy."""
+    times = [run.lifted_s for run in runs if run.good and run.lifted_s is not None]
+    pushed = [1000 * run.verdict.target_moved_m for run in runs if run.good]
+    if times and pushed:
+        report.value(f"time until the can was lifted, {whose}", times, "s")
+        report.value(f"can pushed before the grasp, {whose}", pushed, "mm")
 
 
 def _learn(chosen: argparse.Namespace, place: Path, report: Report) -> str:
@@ -115,18 +126,15 @@ def _try(chosen: argparse.Namespace, place: Path, source: str, report: Report) -
         Case(place / "scenes", seed, chosen.frames, chosen.sensors, place / "tries" / f"{seed}.mcap", source, FOR_S)
         for seed in range(FRESH, FRESH + count)
     ]
-    runs, robot, times = Runs(report), Robot.load(), []
+    runs, robot, found = Runs(report), Robot.load(), []
     for case, result in all_rehearsed(cases, chosen.jobs):
-        found = judged(robot, case)
-        truth = found.verdict
+        found.append(judged(robot, case))
+        truth = found[-1].verdict
         touched = ", ".join(truth.collisions) or "nothing else"
         line = (
             f"scene {case.seed}: {result['outcome']} {result['reason']} lifted {truth.lifted_m:.3f} m, held "
             f"{truth.held}, pushed {truth.target_moved_m:.3f} m before, touched {touched}"
         )
-        runs.add(found.good, line)
-        if found.good and found.lifted_s is not None:
-            times.append(found.lifted_s)
+        runs.add(found[-1].good, line)
     runs.share("fresh scenes in which the policy lifted the can and touched nothing else", least)
-    if times:
-        report.value("time until the can was lifted", times, "s")
+    _compare("the policy", found, report)
