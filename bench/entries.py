@@ -78,6 +78,7 @@ ENTRIES: dict[str, Entry] = {
     "network": Entry("network"),
     "open": Entry("open_capture"),
     "planner": Entry("planner"),
+    "policy": Entry("policy"),
     "pursuit": Entry("pursuit"),
     "readme": Entry("readme"),
     "rehearsals": Entry("rehearsals"),

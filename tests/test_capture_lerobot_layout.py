@@ -170,6 +170,13 @@ def test_the_film_has_each_rows_picture_at_its_time(libraries: Any, tmp_path: Pa
         assert np.abs(shown.astype(int) - picture.astype(int)).mean() < 4
 
 
+def test_a_first_task_whose_pictures_all_wait_in_the_encoder_is_an_episode(libraries: Any, tmp_path: Path) -> None:
+    recorded(tmp_path / "short.mcap", Told("blue_can", 5, 15), Told("red_can", 30, 45))
+    assert main(["export", str(tmp_path / "short.mcap"), "--lerobot", str(tmp_path / "set")]) == 0
+    film = [*decoded(libraries, tmp_path / "set/videos/observation.images.kinect/chunk-000/file-000.mp4")]
+    assert len(film) == json.loads((tmp_path / "set/meta/info.json").read_text())["total_frames"] > 4
+
+
 def test_lerobots_loader_reads_the_dataset(dataset: Path, fetched: Path) -> None:
     loader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
     loaded = loader.LeRobotDataset("cocoro/test", root=dataset, video_backend="pyav")

@@ -240,7 +240,8 @@ class _NumberedFile:
         self.writer: Any = None
 
     def is_full(self, most_mb: int) -> bool:
-        return self.path.stat().st_size >= most_mb * 1_000_000
+        """There is no film yet while its first pictures wait in the encoder."""
+        return self.path.is_file() and self.path.stat().st_size >= most_mb * 1_000_000
 
     def close(self) -> None:
         self.writer.close()
