@@ -17,7 +17,7 @@ def check_camera(camera: str, links: Mapping[str, tuple[str, str | None]], head:
             turning.add(joint)
     if others := sorted(turning - head):
         what = "which is none of the head's" if head else "but there is no [head]"
-        raise ValueError(f"kinect.link: the joint {others[0]!r} turns the camera, {what}")
+        raise ValueError(f"camera: the joint {others[0]!r} turns it, {what}")
     if idle := sorted(head - turning):
         raise ValueError(f"head: the joint {idle[0]!r} does not turn the camera")
 

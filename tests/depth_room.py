@@ -88,7 +88,7 @@ class Room:
     def _depth(self, pose: FloatArray, body: Pose2) -> FloatArray:
         c, s = np.cos(body.yaw_rad), np.sin(body.yaw_rad)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        origin = turn @ (pose[:3, 3] + pose[:3, :3] @ np.array(ROBOT.kinect.depth_offset_m))
+        origin = turn @ (pose[:3, 3] + pose[:3, :3] @ np.array(ROBOT.eye.depth_offset_m))
         origin = origin + np.array([body.x_m, body.y_m, 0.0])
         rays = self._rays @ (turn @ pose[:3, :3]).T
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -20,7 +20,7 @@ LOOK_S = 4.0
 def check(config: KinectConfig, robot: Robot, robot_name: str) -> list[Check]:
     """Check whether frames come from the device, and whether its lenses were measured."""
     checks = [asyncio.run(_look(config))]
-    if robot.kinect.depth_lens is None:
+    if robot.eye.depth_lens is None:
         checks.append(note("Kinect's lenses", "not measured: `cocoro kinect calibrate`"))
     else:
         checks.append(ok("Kinect's lenses", "measured"))
