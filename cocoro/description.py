@@ -15,7 +15,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from cocoro.base import Base
 from cocoro.cameras import CameraRow, eye_of, with_rows
-from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses
+from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_names, check_poses
 from cocoro.description_limbs import Claw, Head, Hull, Marker, Reach
 from cocoro.errors import ConfigError, choice_of
 from cocoro.joints import Group, JointRow, LineName, Network, check_groups, check_lines
@@ -116,6 +116,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         links = {row.name: (row.parent, row.joint) for row in self.link}
         check_camera(eye_of(self.camera, self.eye).link, links, self._head_joints)
         check_claw(len(self.claw.open_sign), self.claw.fixed_pad_m)
+        check_names("camera", [camera.name for camera in self.camera])
         for camera in self.camera:
             check_box(f"camera {camera.name}: mount_min_m", camera.mount_min_m, camera.mount_max_m)
         check_box("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m)

@@ -45,6 +45,15 @@ def check_box(where: str, low_m: Vec3 | None, high_m: Vec3 | None) -> None:
         raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
 
 
+def check_names(kind: str, names: Iterable[str]) -> None:
+    """Refuses a name that two rows of a kind have."""
+    known = set()
+    for name in names:
+        if name in known:
+            raise ValueError(f"{kind}: {name!r} is the name of two")
+        known.add(name)
+
+
 def check_claw(jaws: int, fixed_pad_m: float | None) -> None:
     """Refuses a claw of another number of jaws than one or two, and a fixed pad where both fingers move or none where
     one of them is fixed."""

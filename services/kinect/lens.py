@@ -83,7 +83,7 @@ class Straightener:
         colour, depth = frame.colour, frame.depth
         if self._colour is not None:
             colour = np.asarray(cv2.remap(colour, self._colour[0], self._colour[1], cv2.INTER_LINEAR), np.uint8)
-        if self._depth is not None:
+        if depth is not None and self._depth is not None:
             u, v = self._depth
             carried = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=NO_DATA)
             depth = np.asarray(carried, np.uint16)

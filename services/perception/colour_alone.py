@@ -1,17 +1,20 @@
 """Places known objects by colour alone, for a camera without depth.
 
-An object is taken to stand on the floor the robot drives on. Two measurements tell its distance: the ray through its
-foot, the lowest row of its region, meets the floor; and its outline is as large as the known object's there. Each has
-a standard deviation: the first by the row's and the camera's tilt, which grows with the square of the distance, the
-second by the outline's edge. Their weighted mean is the place, and goes out with its own standard deviation. Where they
-contradict each other, the foot is hidden, or the object does not stand on the floor: then the outline alone counts, and
-the detection is doubtful. (Derived; the ray's foot as in single-view metrology, Criminisi 2000.)
+An object is taken to stand on the floor that the robot drives on. Three measurements tell its distance: the ray through
+its foot, the lowest row of its region, meets the floor; the one through its top meets the height of the known object;
+and its outline is as large as the known object's there. Each has a standard deviation: the first two by the row and by
+the camera's tilt, growing with the square of the distance, the third by the outline's edge.
+
+Foot and outline, weighted, are the place of an object that is seen whole. Where the top says nearer than the foot, a
+part is hidden: of what stands on the floor, before a camera that looks down, that is the foot, so the top counts, and
+the detection is doubtful. Where the top says farther, it does not stand on the floor; then the outline alone counts.
+(Derived; the ray's foot as in single-view metrology, Criminisi 2000.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from math import atan2, cos, hypot, inf, log, pi, sin, sqrt
+from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
 from typing import NamedTuple
 
 import cv2
@@ -24,7 +27,7 @@ from cocoro.robot import Camera, Robot
 from services.perception.image import ImageSighting
 from services.perception.localise import SAME_PLACE, Localiser, detection_of
 
-EDGE_PX = 0.7
+EDGE_PX = 0.8
 """Standard deviation of an edge of a region, px, at any resolution."""
 TILT_RAD = 0.005
 """Standard deviation of the camera's tilt against the floor, which an own calibration of its mount reaches."""
@@ -33,15 +36,23 @@ HEIGHT_SHARE = 0.01
 SIZE_SHARE = 0.02
 """The same of the object's size and of the focal length."""
 CONTRADICT = 3.0
-"""Standard deviations between the two distances from which they contradict each other."""
-LEAST_SHARE, MOST_SHARE = 0.3, 1.7
+"""Standard deviations between two distances from which they contradict each other."""
+HIDDEN_PART = 0.25
+"""Of an object that is hidden in part: its distance's standard deviation as a share of what foot and top differ by."""
+LEAST_SHARE, MOST_SHARE = 0.15, 1.7
 """Shares of the pixels that the object would have where it stands. Outside of them, it is another thing."""
+MOST_MISFIT, DOUBTFUL, SEEN_THERE, SAME_M = 8.0, 2.0, 10.0, 0.15
+"""Of two labels of one region the one with the smaller misfit wins. Most that the sides' ratio counts; what a doubtful
+one has more; what one has less that won within so many metres in the picture before: a can behind the own hand may
+look like a ball."""
 HIGHEST_M = 0.6
 """Greatest height of an object's middle that the robot can hold up."""
 UNDER_FLOOR_M = 0.04
 CIRCLE = np.linspace(0.0, 2 * pi, 24, endpoint=False)
 STEPS = 12
 NEAREST_M, FARTHEST_M = 0.05, 20.0
+LEAST_ABOVE_M = 0.05
+"""A camera that is less above an object's top does not see it as one that looks down."""
 
 
 class Placed(NamedTuple):
@@ -62,6 +73,8 @@ class ColourLocaliser(Localiser):
     def __init__(self, robot: Robot, catalogue: Catalogue, occluded_share: float) -> None:
         super().__init__(robot, catalogue, occluded_share)
         self._range_m = robot.eye.max_range_m
+        self._before: dict[str, FloatArray] = {}
+        """Where the objects were in the picture before, body frame, (3,)."""
 
     def locate(
         self, sightings: Sequence[ImageSighting], camera: Camera, angles_rad: FloatArray | None
@@ -69,25 +82,27 @@ class ColourLocaliser(Localiser):
         if angles_rad is None:
             return [detection_of(sighting, None, "no head angles") for sighting in sightings]
         pose = self.camera_pose(angles_rad)
-        found = {
-            sighting.label: placed
-            for sighting in sightings
-            if (placed := place(sighting, self._catalogue[sighting.label], camera, pose, self._occluded_share))
-        }
+        found: dict[str, Placed] = {}
+        for sighting in sightings:
+            placed = place(sighting, self._catalogue[sighting.label], camera, pose, self._occluded_share)
+            if placed is not None and hypot(*placed.centre_m[:2]) <= self._range_m:
+                found[sighting.label] = placed
         seen = [sighting for sighting in sightings if sighting.label in found]
-        lost = {
-            one.label
-            for one, other in _together(seen)
-            if found[one.label].misfit > found[other.label].misfit
-        }  # fmt: skip
+        misfit = {label: self._misfit(label, placed) for label, placed in found.items()}
+        lost = {one.label for one, other in _together(seen) if misfit[one.label] > misfit[other.label]}
+        self._before = {label: placed.centre_m for label, placed in found.items() if label not in lost}
         detections = []
         for sighting in seen:
-            placed = found[sighting.label]
-            if sighting.label in lost or hypot(*placed.centre_m[:2]) > self._range_m:
-                continue
-            x, y, z = placed.centre_m.tolist()
-            detections.append(detection_of(sighting, (x, y, z), placed.note, placed.sigma_m))
+            if sighting.label not in lost:
+                placed = found[sighting.label]
+                x, y, z = placed.centre_m.tolist()
+                detections.append(detection_of(sighting, (x, y, z), placed.note, placed.sigma_m))
         return detections
+
+    def _misfit(self, label: str, placed: Placed) -> float:
+        before = self._before.get(label)
+        there = before is not None and float(np.linalg.norm(placed.centre_m - before)) < SAME_M
+        return placed.misfit + DOUBTFUL * bool(placed.note) - SEEN_THERE * there
 
 
 def place(
@@ -95,36 +110,55 @@ def place(
 ) -> Placed | None:
     """Place an object. `pose`: the camera's in the body frame, 4 x 4. None where it is no such object."""
     view = _View(known, camera, pose)
-    left, _, right, bottom = sighting.box_px
-    cut_below, cut_beside = bottom >= camera.height - 1, left <= 1 or right >= camera.width - 1
+    left, top, right, bottom = sighting.box_px
+    beside = left <= 1 or right >= camera.width - 1
     ray = pose[:3, :3] @ camera.ray(sighting.u_px, sighting.v_px)
     bearing = atan2(ray[1], ray[0])
-    away_m = view.by_foot(bearing, bottom - 0.5) if not cut_below else inf
-    # A region's outermost pixels are blended with the background on average half a pixel inside of the outline.
-    size_m = view.by_size(bearing, float(sighting.area_px))
-    stands = np.isfinite(away_m)
-    if not stands and (cut_below and cut_beside):
-        return None
-    foot_sigma, size_sigma = view.foot_sigma_m(away_m) if stands else inf, view.size_sigma_m(size_m)
-    share = sighting.area_px / view.counted_px(bearing, away_m) if stands else 1.0
-    aspect = view.aspect_misfit(bearing, away_m if stands else size_m, sighting) if not sighting.cut else 0.0
-    if stands and (sighting.cut or share < occluded_share):
-        # Less than the whole object is seen, but its foot is.
-        if share < LEAST_SHARE and not sighting.cut:
+    # A region's outermost pixels reach half a pixel beyond their centres.
+    foot_m = inf if bottom >= camera.height - 1 else view.by_foot(bearing, bottom - 0.5)
+    top_m = inf if top <= 1 else view.by_top(bearing, top - 0.5)
+    if sighting.cut:
+        away_m = min(foot_m, top_m)
+        if not isfinite(away_m):
             return None
-        note = "cut" if sighting.cut else "occluded"
-        return Placed(view.standing_m(bearing, away_m), foot_sigma, note, aspect + abs(log(share)))
-    apart = abs(away_m - size_m) / hypot(foot_sigma, size_sigma) if stands else inf
-    if apart <= CONTRADICT:
-        weights = np.array([foot_sigma, size_sigma]) ** -2.0
-        fused_m = float(weights @ np.array([away_m, size_m]) / weights.sum())
-        sigma_m = float(1 / sqrt(weights.sum()))
-        return Placed(view.standing_m(bearing, fused_m), sigma_m, "", aspect + 0.5 * apart**2)
-    centre = view.along_m(ray, size_m)
-    reach = known.size_m[2] / 2
-    if not reach - UNDER_FLOOR_M - 3 * size_sigma * abs(ray[2]) / float(np.linalg.norm(ray)) < centre[2] < HIGHEST_M:
+        sigma_m = view.foot_sigma_m(away_m) if away_m == foot_m else view.top_sigma_m(away_m)
+        aside_m = (right - left) / 2 * away_m / camera.fx if beside else 0.0
+        return Placed(view.standing_m(bearing, away_m), hypot(sigma_m, aside_m), "cut", 0.0)
+    size_m = view.by_size(bearing, float(sighting.area_px))
+    apart_m = foot_m - top_m if isfinite(foot_m) and isfinite(top_m) else (inf if isfinite(top_m) else -inf)
+    doubt_m = view.edges_sigma_m(top_m if isfinite(top_m) else foot_m) if apart_m > -inf else 1.0
+    if apart_m > CONTRADICT * doubt_m:
+        hidden_m = min(HIDDEN_PART * apart_m, known.size_m[2])
+        share = sighting.area_px / view.counted_px(bearing, top_m)
+        if not LEAST_SHARE < share < MOST_SHARE:
+            return None
+        sigma_m = hypot(view.top_sigma_m(top_m), hidden_m)
+        return Placed(view.standing_m(bearing, top_m), sigma_m, "occluded", abs(log(share)))
+    aspect = view.aspect_misfit(bearing, foot_m if isfinite(foot_m) else size_m, sighting)
+    if apart_m < -CONTRADICT * doubt_m:
+        return _raised(view, known, ray, size_m, aspect)
+    share = sighting.area_px / view.counted_px(bearing, foot_m)
+    if not LEAST_SHARE < share < MOST_SHARE:
         return None
-    return Placed(centre, size_sigma, "cut" if sighting.cut else "occluded", aspect + 0.5 * CONTRADICT**2)
+    foot_sigma, size_sigma = view.foot_sigma_m(foot_m), view.size_sigma_m(size_m)
+    if share < occluded_share:  # something hides a side
+        return Placed(view.standing_m(bearing, foot_m), foot_sigma, "occluded", aspect)
+    weights = np.array([foot_sigma, size_sigma]) ** -2.0
+    fused_m = float(weights @ np.array([foot_m, size_m]) / weights.sum())
+    apart = abs(foot_m - size_m) / hypot(foot_sigma, size_sigma)
+    note = "occluded" if apart > CONTRADICT else ""
+    fit = min(aspect + 0.5 * apart**2, MOST_MISFIT)
+    return Placed(view.standing_m(bearing, fused_m), float(1 / sqrt(weights.sum())), note, fit)
+
+
+def _raised(view: _View, known: ObjectSpec, ray: FloatArray, size_m: float, aspect: float) -> Placed | None:
+    """An object that does not stand on the floor: the robot holds it, or it is no such object."""
+    if not isfinite(size_m):
+        return None
+    centre, sigma_m = view.along_m(ray, size_m), view.size_sigma_m(size_m)
+    if not known.size_m[2] / 2 - UNDER_FLOOR_M < centre[2] < HIGHEST_M:
+        return None
+    return Placed(centre, sigma_m, "occluded", min(aspect + 0.5 * CONTRADICT**2, MOST_MISFIT))
 
 
 def _together(sightings: Sequence[ImageSighting]) -> Iterator[tuple[ImageSighting, ImageSighting]]:
@@ -165,6 +199,12 @@ class _View:
         horizon."""
         return self._solved(lambda away_m: -self._box(bearing, away_m)[3], -row_px)
 
+    def by_top(self, bearing: float, row_px: float) -> float:
+        """The distance at which the object's highest row is this one; infinite where the camera is not above it."""
+        if self._eye[2] < self._height_m + LEAST_ABOVE_M:
+            return inf
+        return self._solved(lambda away_m: -self._box(bearing, away_m)[1], -row_px)
+
     def by_size(self, bearing: float, area_px: float) -> float:
         """The distance at which the object that stands there has so many pixels."""
         return self._solved(lambda away_m: -log(self.counted_px(bearing, away_m)), -log(max(area_px, 1.0)))
@@ -180,6 +220,20 @@ class _View:
         angle = hypot(EDGE_PX / self._camera.fy, TILT_RAD)
         return hypot((height_m**2 + away_m**2) / height_m * angle, HEIGHT_SHARE * away_m)
 
+    def top_sigma_m(self, away_m: float) -> float:
+        above_m = self._eye[2] - self._height_m
+        angle = hypot(EDGE_PX / self._camera.fy, TILT_RAD)
+        share = hypot(HEIGHT_SHARE * self._eye[2], SIZE_SHARE * self._height_m) / above_m
+        return hypot((above_m**2 + away_m**2) / above_m * angle, share * away_m)
+
+    def edges_sigma_m(self, away_m: float) -> float:
+        """Standard deviation of what foot and top differ by, which the camera's tilt and height shift alike."""
+        height_m = self._eye[2]
+        above_m = max(height_m - self._height_m, LEAST_ABOVE_M)
+        rows = [(up_m**2 + away_m**2) / up_m for up_m in (height_m, above_m)]
+        tilt_m = TILT_RAD * abs(rows[0] - rows[1])
+        return hypot(EDGE_PX / self._camera.fy * hypot(*rows), SIZE_SHARE * self._height_m / above_m * away_m, tilt_m)
+
     def size_sigma_m(self, away_m: float) -> float:
         far_m = hypot(away_m, self._eye[2])
         side_px = self._camera.fx * sqrt(2 * self._radius_m * self._height_m) / far_m
@@ -191,7 +245,7 @@ class _View:
         own = sighting.box_px
         ratio = ((right - left) / (bottom - top)) / ((own[2] - own[0]) / (own[3] - own[1]))
         doubt = hypot(0.05, EDGE_PX / min(own[2] - own[0], own[3] - own[1]))
-        return 0.5 * (log(ratio) / doubt) ** 2
+        return min(0.5 * (log(ratio) / doubt) ** 2, MOST_MISFIT)
 
     def _box(self, bearing: float, away_m: float) -> tuple[float, float, float, float]:
         u, v = self._outline(bearing, away_m)
