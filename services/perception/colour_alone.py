@@ -45,6 +45,8 @@ MOST_MISFIT, DOUBTFUL, SEEN_THERE, SAME_M = 8.0, 2.0, 10.0, 0.15
 """Of two labels of one region the one with the smaller misfit wins. Most that the sides' ratio counts; what a doubtful
 one has more; what one has less that won within so many metres in the picture before: a can behind the own hand may
 look like a ball."""
+WIDER = 5.0
+"""Standard deviations by which a region that the picture's edge cuts may be wider than the object."""
 HIGHEST_M = 0.6
 """Greatest height of an object's middle that the robot can hold up."""
 UNDER_FLOOR_M = 0.04
@@ -89,7 +91,8 @@ class ColourLocaliser(Localiser):
                 found[sighting.label] = placed
         seen = [sighting for sighting in sightings if sighting.label in found]
         misfit = {label: self._misfit(label, placed) for label, placed in found.items()}
-        lost = {one.label for one, other in _together(seen) if misfit[one.label] > misfit[other.label]}
+        order = {sighting.label: (misfit[sighting.label], number) for number, sighting in enumerate(seen)}
+        lost = {one.label for one, other in _together(seen) if order[one.label] > order[other.label]}
         self._before = {label: placed.centre_m for label, placed in found.items() if label not in lost}
         detections = []
         for sighting in seen:
@@ -121,9 +124,13 @@ def place(
         away_m = min(foot_m, top_m)
         if not isfinite(away_m):
             return None
+        wider = view.width_misfit(bearing, away_m, right - left)
+        if sighting.area_px > MOST_SHARE * view.counted_px(bearing, away_m) or wider > WIDER:
+            return None
         sigma_m = view.foot_sigma_m(away_m) if away_m == foot_m else view.top_sigma_m(away_m)
         aside_m = (right - left) / 2 * away_m / camera.fx if beside else 0.0
-        return Placed(view.standing_m(bearing, away_m), hypot(sigma_m, aside_m), "cut", 0.0)
+        misfit = min(0.5 * wider**2, MOST_MISFIT) if wider > 0 or not beside else 0.0
+        return Placed(view.standing_m(bearing, away_m), hypot(sigma_m, aside_m), "cut", misfit)
     size_m = view.by_size(bearing, float(sighting.area_px))
     apart_m = foot_m - top_m if isfinite(foot_m) and isfinite(top_m) else (inf if isfinite(top_m) else -inf)
     doubt_m = view.edges_sigma_m(top_m if isfinite(top_m) else foot_m) if apart_m > -inf else 1.0
@@ -246,6 +253,11 @@ class _View:
         ratio = ((right - left) / (bottom - top)) / ((own[2] - own[0]) / (own[3] - own[1]))
         doubt = hypot(0.05, EDGE_PX / min(own[2] - own[0], own[3] - own[1]))
         return min(0.5 * (log(ratio) / doubt) ** 2, MOST_MISFIT)
+
+    def width_misfit(self, bearing: float, away_m: float, width_px: float) -> float:
+        """By how many standard deviations a region is wider than the object."""
+        left, _, right, _ = self._box(bearing, away_m)
+        return log(width_px / (right - left)) / hypot(0.05, 1.4 * EDGE_PX / width_px)
 
     def _box(self, bearing: float, away_m: float) -> tuple[float, float, float, float]:
         u, v = self._outline(bearing, away_m)

@@ -69,7 +69,7 @@ class ColourFloorScanner(FloorScanner):
         if seen is None or (self._colour is not None and not _alike(seen, self._colour)):
             return None
         self._colour = seen if self._colour is None else self._colour + FOLLOW * (seen - self._colour)
-        alike = _alike(lab, self._colour).astype(np.uint8)
+        alike = (_alike(lab, self._colour) | own).astype(np.uint8)
         return np.where(own, np.float32(np.nan), np.asarray(cv2.medianBlur(alike, 3), dtype=np.float32))
 
     def _own_picture(self, columns: int, rows: int) -> BoolArray:
