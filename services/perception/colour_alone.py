@@ -274,14 +274,11 @@ class _View:
             beside = np.cross(towards, [0.0, 0.0, 1.0])
             beside /= np.linalg.norm(beside)
             above = np.cross(beside, towards)
-            rim = self._radius_m * sqrt(1 - sine**2)
-            middle = centre - towards * self._radius_m * sine
-            points = middle + rim * (np.outer(np.cos(CIRCLE), beside) + np.outer(np.sin(CIRCLE), above))
+            middle, rim_m = centre - towards * self._radius_m * sine, self._radius_m * sqrt(1 - sine**2)
+            points = middle + rim_m * (np.outer(np.cos(CIRCLE), beside) + np.outer(np.sin(CIRCLE), above))
         else:
             rim = self._radius_m * np.stack([np.cos(CIRCLE), np.sin(CIRCLE)], axis=1) + centre[:2]
-            points = np.concatenate(
-                [np.column_stack([rim, np.full(len(rim), z)]) for z in (0.0, self._height_m)]
-            )  # fmt: skip
+            points = np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in (0.0, self._height_m)])
         x, y, z = ((points - self._eye) @ self._pose[:3, :3]).T
         z = np.maximum(z, 0.02)
         return self._camera.cx + self._camera.fx * x / z, self._camera.cy + self._camera.fy * y / z

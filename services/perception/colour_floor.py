@@ -61,8 +61,8 @@ class ColourFloorScanner(FloorScanner):
             return None
         step = max(image.width // 80, 1)
         size = len(range(step // 2, image.width, step)), len(range(step // 2, image.height, step))
-        small = cv2.resize(image.colour, size, interpolation=cv2.INTER_AREA)
-        lab = np.asarray(cv2.cvtColor(np.float32(small) / np.float32(255), cv2.COLOR_RGB2LAB), dtype=np.float64)
+        small = np.asarray(cv2.resize(image.colour, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        lab = np.asarray(cv2.cvtColor(small / np.float32(255), cv2.COLOR_RGB2LAB), dtype=np.float64)
         own = self._own_picture(*size)
         strip = slice(-max(round(STRIP * len(lab)), 1), None)
         seen = _usual(lab[strip][~own[strip]])
