@@ -242,9 +242,10 @@ class _View:
         return hypot(EDGE_PX / self._camera.fy * hypot(*rows), SIZE_SHARE * self._height_m / above_m * away_m, tilt_m)
 
     def size_sigma_m(self, away_m: float) -> float:
-        far_m = hypot(away_m, self._eye[2])
-        side_px = self._camera.fx * sqrt(2 * self._radius_m * self._height_m) / far_m
-        return far_m * hypot(SIZE_SHARE, EDGE_PX / side_px)
+        far_m, width_m = hypot(away_m, self._eye[2]), 2 * self._radius_m
+        # All of the outline is off by the same, so the area by that times the circumference.
+        edge = EDGE_PX * far_m / self._camera.fx * (width_m + self._height_m) / (width_m * self._height_m)
+        return far_m * hypot(SIZE_SHARE, edge)
 
     def aspect_misfit(self, bearing: float, away_m: float, sighting: ImageSighting) -> float:
         """How badly the sides' ratio of the region's box fits."""
