@@ -81,7 +81,9 @@ class Room:
             depth = depth + self._draws.normal(size=depth.shape) * self.noise * depth**2
         raw = ROBOT.depth_code(depth)
         image = RgbdImage(np.zeros((HEIGHT, WIDTH, 3), np.uint8), raw, ROBOT)
-        seen = self._scanner.scan(self._scanner.sample(image), WIDTH, HEIGHT, pose)
+        grid = self._scanner.sample(image)
+        assert grid is not None
+        seen = self._scanner.scan(grid, WIDTH, HEIGHT, pose)
         seen.stamp_ns, seen.nearest = self.now_ns, self._scanner.nearest(image)
         return seen
 

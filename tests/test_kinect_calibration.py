@@ -119,6 +119,7 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
     # As readers of frames assume: a pinhole beside the colour camera that looks in the same direction.
     beside_m = points_m - robot.eye.depth_offset_m
     u, v = np.rint(Lens.of(robot.camera).pixels(beside_m)).astype(int).T
+    assert straight.depth is not None
     depth_m = robot.depth_m(straight.depth)[v, u]
     a, b, _ = robot.eye.curve
     step_m = a / b * (1.0 + (beside_m[:, 2] / a) ** 2)

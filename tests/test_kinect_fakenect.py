@@ -120,6 +120,7 @@ def play(
 def number_of(shot: RawFrame, colours: list[bytes], depths: list[bytes]) -> int:
     """The number of the frame in the recording. Its colour and depth must be complete, and of the same moment."""
     number = colours.index(shot.colour.tobytes())
+    assert shot.depth is not None
     assert shot.depth.astype("<u2").tobytes() == depths[number]
     return number
 
