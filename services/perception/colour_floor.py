@@ -42,7 +42,7 @@ class ColourFloorScanner(FloorScanner):
 
     def __init__(self, robot: Robot, config: PerceptionConfig) -> None:
         super().__init__(robot, config)
-        self._park = robot.poses["park"]
+        self._parked = {name: angle for name, angle in robot.poses["park"].items() if name in robot.group_joints("arm")}
         self._folded = False
         self._colour: FloatArray | None = None
         """CIELAB, (3,); None before the first picture that shows floor."""
@@ -51,8 +51,8 @@ class ColourFloorScanner(FloorScanner):
 
     def watch(self, state: ServoState) -> None:
         angles = dict(zip(state.joints, state.position_rad, strict=True))
-        if self._park.keys() <= angles.keys():
-            self._folded = all(abs(angles[name] - angle) <= FOLDED_RAD for name, angle in self._park.items())
+        if self._parked.keys() <= angles.keys():
+            self._folded = all(abs(angles[name] - angle) <= FOLDED_RAD for name, angle in self._parked.items())
 
     def sample(self, image: RgbdImage) -> Float32Array | None:
         """Whether the pixels of the coarse grid have the floor's colour, 1 or 0, and NaN where the robot sees itself,
@@ -75,7 +75,8 @@ class ColourFloorScanner(FloorScanner):
     def _own_picture(self, columns: int, rows: int) -> BoolArray:
         size = columns, rows
         if size not in self._own:
-            self._own[size] = own_picture(self._robot, self._robot.camera.scaled(columns, rows), self._park)
+            camera, park = self._robot.camera.scaled(columns, rows), self._robot.poses["park"]
+            self._own[size] = own_picture(self._robot, camera, park)
         return self._own[size]
 
     def nearest(self, image: RgbdImage) -> bytes:
