@@ -68,7 +68,7 @@ class FetchLimits:
     def of(self, place_m: tuple[float, float, float]) -> dict[str, float]:
         """Seconds by phase for a target at (x, y, z), body frame at the begin, m."""
         robot, config, reachability = self._robot, self._config, self._actuators.reachability
-        base, kinect = robot.base, robot.kinect
+        base, kinect = robot.base, robot.eye
         aim_m = grasp_aim(self._actuators)
         offset = offset_to(place_m[:2], aim_m)
         grasp = reachability.grasp((*aim_m, place_m[2]))

@@ -44,7 +44,7 @@ class PlainOpenCV:
         self._camera = robot.camera.scaled(scene.frames[0].width, scene.frames[0].height)
         self._head = robot.camera_chain.pose({"neck_pan": PAN, "neck_tilt": TILT})
         self._table = robot.depth_m(np.arange(2048, dtype=np.uint16))
-        self._shift_px_m = -self._camera.fx * robot.kinect.depth_offset_m[0]
+        self._shift_px_m = -self._camera.fx * robot.eye.depth_offset_m[0]
         limits = [np.clip(np.rint(box), 0, 255) for box in scene.hsv]
         self._ranges = [(tuple(box[0].tolist()), tuple(box[1].tolist())) for box in limits]
 

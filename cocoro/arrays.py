@@ -16,7 +16,7 @@ ImageArray = NDArray[np.uint8]
 MaskArray = NDArray[np.uint8]
 """A mask as OpenCV takes it: rows x columns of 0 and 255."""
 CodeArray = NDArray[np.uint16]
-"""Raw depth: rows x columns of the Kinect's 11-bit codes."""
+"""Raw depth: rows x columns of the camera's codes."""
 
 
 def median(values: FloatArray | Float32Array) -> float:

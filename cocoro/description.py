@@ -14,16 +14,27 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from cocoro.base import Base
-from cocoro.description_checks import check_box, check_camera, check_claw, check_masses, check_poses, check_wheels
-from cocoro.description_limbs import Claw, Head, Hull, Kinect, Marker, Reach
-from cocoro.errors import ConfigError
+from cocoro.cameras import CameraRow, eye_of, with_rows
+from cocoro.description_checks import (
+    check_box,
+    check_camera,
+    check_claw,
+    check_masses,
+    check_names,
+    check_poses,
+    check_wheels,
+)
+from cocoro.description_limbs import Claw, Head, Hull, Marker, Reach
+from cocoro.errors import ConfigError, choice_of
 from cocoro.joints import Group, JointRow, LineName, Network, ServoPlace, check_groups, check_lines
 from cocoro.link_row import LinkRow
 from cocoro.units import Vec3
 
 OWN_FILE = "calliope.toml"
-SHIPPED = ("calliope", "lekiwi")
+SHIPPED = ("calliope", "lekiwi", "lekiwi-colour")
 """Robots whose descriptions the project ships: where a file is asked for, the bare name is that description."""
+BASED_ON = "based_on"
+"""Field of a file: the shipped description that it changes, with only its own values in the file."""
 _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
 
 
@@ -86,7 +97,9 @@ class Solid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: str
     base: Base
-    kinect: Kinect
+    camera: Annotated[list[CameraRow], Meta(min_length=1)]
+    eye: str = ""
+    """Name of the camera by which the robot finds things, whose pictures are `kinect/frame`; '' is the first."""
     head: Head | None = None
     link: list[LinkRow]
     arm: Arm
@@ -109,9 +122,11 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         self._check_places()
         self._check_limbs()
         links = {row.name: (row.parent, row.joint) for row in self.link}
-        check_camera(self.kinect.link, links, self._head_joints)
+        check_camera(eye_of(self.camera, self.eye).link, links, self._head_joints)
         check_claw(len(self.claw.open_sign), self.claw.fixed_pad_m)
-        check_box("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m)
+        check_names("camera", [camera.name for camera in self.camera])
+        for camera in self.camera:
+            check_box(f"camera {camera.name}: mount_min_m", camera.mount_min_m, camera.mount_max_m)
         check_box("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m)
         check_masses(links, [part.link for part in self.solid.part if part.mass_kg > 0.0], self.claw.open_sign)
 
@@ -125,7 +140,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         none."""
         rows = {row.name: row for row in self.link}
         groups: dict[str, Group] = {}
-        for tip in (self.arm.tip, self.kinect.link):
+        for tip in (self.arm.tip, eye_of(self.camera, self.eye).link):
             row = rows.get(tip)
             while row is not None:
                 if row.joint is not None:
@@ -152,7 +167,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def _check_places(self) -> None:
         links = {row.name for row in self.link}
-        places = [("arm.tip", self.arm.tip), ("kinect.link", self.kinect.link)]
+        places = [("arm.tip", self.arm.tip), *((f"camera {row.name}: link", row.link) for row in self.camera)]
         places += [("marker", self.marker.link)] if self.marker is not None else []
         places += [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
         places += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
@@ -192,15 +207,27 @@ def read(path: Path | None, override: Path | None) -> Description:
     in place of its own. Raises ConfigError naming file and field."""
     where = str(path or OWN_FILE)
     try:
-        data = tomllib.loads(_text(where))
+        data = _whole(tomllib.loads(_text(where)))
         if override is not None:
             where = str(override)
-            _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
+            _merge(data, with_rows(tomllib.loads(override.read_text(encoding="utf-8")), data))
             where = f"{path} with {override}" if path else where  # either may have the wrong field
         return msgspec.convert(data, Description)
     except (ValueError, OSError) as error:  # not UTF-8, not TOML, not a description, not there
         advice = _MISSING if "missing required field" in str(error) else ""
         raise ConfigError(f"robot description {where}: {error}{advice}") from error
+
+
+def _whole(data: dict[str, Any]) -> dict[str, Any]:
+    """The data of a file with that of the description that it is based on."""
+    name = data.pop(BASED_ON, None)
+    if name is None:
+        return with_rows(data)
+    if name not in SHIPPED:
+        raise ValueError(f"{BASED_ON}: {choice_of(str(name), SHIPPED)}")
+    whole = _whole(tomllib.loads(_text(name)))
+    _merge(whole, with_rows(data, whole))
+    return whole
 
 
 def is_shipped(file: str | Path) -> bool:
@@ -220,6 +247,7 @@ def completed(data: Any) -> Any:
     """Recorded data with the fields that descriptions did not have yet when it was recorded."""
     if not isinstance(data, dict):
         return data
+    data = with_rows(data)
     claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
     own = tomllib.loads(_text("calliope"))
     for table in ("hull", "head", "arm", "solid"):

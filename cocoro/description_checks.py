@@ -18,7 +18,7 @@ def check_camera(camera: str, links: Mapping[str, tuple[str, str | None]], head:
             turning.add(joint)
     if others := sorted(turning - head):
         what = "which is none of the head's" if head else "but there is no [head]"
-        raise ValueError(f"kinect.link: the joint {others[0]!r} turns the camera, {what}")
+        raise ValueError(f"camera: the joint {others[0]!r} turns it, {what}")
     if idle := sorted(head - turning):
         raise ValueError(f"head: the joint {idle[0]!r} does not turn the camera")
 
@@ -44,6 +44,15 @@ def check_box(where: str, low_m: Vec3 | None, high_m: Vec3 | None) -> None:
             raise ValueError(f"{where}: a box has two corners, and one of them is missing")
     elif not all(low < high for low, high in zip(low_m, high_m, strict=True)):
         raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
+
+
+def check_names(kind: str, names: Iterable[str]) -> None:
+    """Refuses a name that two rows of a kind have."""
+    known = set()
+    for name in names:
+        if name in known:
+            raise ValueError(f"{kind}: {name!r} is the name of two")
+        known.add(name)
 
 
 def check_claw(jaws: int, fixed_pad_m: float | None) -> None:

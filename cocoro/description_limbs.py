@@ -1,4 +1,4 @@
-"""The tables of a robot description that say how it sees and grasps: head, camera, marker, claw, and the arm's hull."""
+"""The tables of a robot description that say how it looks and grasps: head, marker, claw, and the arm's hull."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from msgspec import Meta
 
 from cocoro.units import Positive, Vec3
 
-LensValues = tuple[float, float, float, float, float, float, float, float, float]
-"""fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
-
 
 class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The joints that turn the camera. Without this table it is fixed on the body, and the base turns to look about."""
@@ -21,35 +18,6 @@ class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """About the vertical, counter-clockwise positive."""
     tilt: str
     """Up positive."""
-
-
-class Kinect(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    width: int
-    height: int
-    rate_hz: Positive
-    horizontal_fov_rad: Positive
-    vertical_fov_rad: Positive
-    depth_offset_m: Vec3
-    projector_offset_m: Vec3
-    min_range_m: Positive
-    max_range_m: Positive
-    depth_curve: Vec3
-    mount_min_m: Vec3 | None = None
-    mount_max_m: Vec3 | None = None
-    """The box that holds the camera up, body frame, which arm and hand must not enter; both corners or none."""
-    colour_lens: LensValues | None = None
-    depth_lens: LensValues | None = None
-    """Calibration of both lenses. The driver rectifies its images; readers of frames use the fields of view above."""
-    depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
-    """Rotation vector from the depth camera's frame to the colour camera's."""
-    link: str = "camera"  # what it was called before it could be called otherwise
-    """The link that carries it, whose frame is the colour camera's: x right, y down, z forward."""
-
-    @property
-    def mount(self) -> tuple[Vec3, Vec3] | None:
-        """The corners of the mount's box; None where nothing is to be kept clear of."""
-        low_m, high_m = self.mount_min_m, self.mount_max_m
-        return None if low_m is None or high_m is None else (low_m, high_m)
 
 
 class Reach(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

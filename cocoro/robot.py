@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import UNSET
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
+from cocoro.cameras import eye_of
 from cocoro.description import Description, completed, read
 from cocoro.description_limbs import Marker
 from cocoro.errors import ConfigError, field_text
@@ -57,7 +58,9 @@ class Robot:
         self.name = spec.name
         self.base = spec.base
         self.drive = spec.base.drive
-        self.kinect = spec.kinect
+        self.cameras = {row.name: row for row in spec.camera}
+        self.eye = eye_of(spec.camera, spec.eye)
+        """The camera by which it finds things."""
         self.head = spec.head
         self.arm = spec.arm
         self.reach = None if spec.reach is UNSET else spec.reach
@@ -163,7 +166,7 @@ class Robot:
     @cached_property
     def camera_chain(self) -> Chain:
         """From the body to the colour camera's frame: x right, y down, z forward."""
-        return self.chain(self.kinect.link)
+        return self.chain(self.eye.link)
 
     def lacks(self, parts: Iterable[str]) -> str:
         """The first of the parts (`cocoro.tasks.BodyPart`) that this robot does not have, a sentence; '' when it has
@@ -187,7 +190,7 @@ class Robot:
     @cached_property
     def camera_pivot(self) -> str:
         """The link about whose place the camera tilts: that of the neck's tilt, or the fixed camera's own."""
-        return self.link_of(self.head.tilt) if self.head is not None else self.kinect.link
+        return self.link_of(self.head.tilt) if self.head is not None else self.eye.link
 
     def chain(self, tip: str) -> Chain:
         """The links from the body to the tip. Raises KeyError naming a link that is missing."""
@@ -199,7 +202,7 @@ class Robot:
 
     @cached_property
     def camera(self) -> Camera:
-        k = self.kinect
+        k = self.eye
         return Camera(
             k.width,
             k.height,
@@ -209,25 +212,41 @@ class Robot:
             (k.height - 1) / 2,
         )
 
+    @property
+    def sees_depth(self) -> bool:
+        """Whether its pictures have depth beside colour."""
+        return self.eye.depth != "none"
+
     def depth_m(self, raw: CodeArray) -> Float32Array:
-        """Metres along the optical axis for raw 11-bit depth codes, in their shape; no data (2047 and above) is NaN."""
-        return self._depth_table[np.minimum(raw, 2047)]
+        """Metres along the optical axis for the depth codes of `eye`, in their shape; no data is NaN."""
+        return self._depth_table[np.minimum(raw, self.eye.no_depth_code)]
 
     def depth_code(self, depth_m: FloatArray) -> CodeArray:
-        """Raw codes for metres along the optical axis, in their shape: the inverse of `depth_m` up to quantisation.
-        Outside of the sensor's range it is 2047."""
-        a, b, c = self.kinect.depth_curve
-        inside = (depth_m >= self.kinect.min_range_m) & (depth_m <= self.kinect.max_range_m)
-        codes = np.rint(b * (np.arctan(np.where(inside, depth_m, 1.0) / a) - c))
-        return np.where(inside, codes, 2047).astype(np.uint16)
+        """Codes for metres along the optical axis, in their shape: the inverse of `depth_m` up to quantisation. Outside
+        of the sensor's range it is that of no data. Raises ValueError for a camera without depth."""
+        eye = self.eye
+        inside = (depth_m >= eye.min_range_m) & (depth_m <= eye.max_range_m)
+        if eye.depth == "mm":
+            codes = np.rint(1000.0 * np.where(inside, depth_m, 1.0))
+        else:
+            a, b, c = eye.curve
+            codes = np.rint(b * (np.arctan(np.where(inside, depth_m, 1.0) / a) - c))
+        return np.where(inside, codes, eye.no_depth_code).astype(np.uint16)
 
     @cached_property
     def _depth_table(self) -> Float32Array:
-        a, b, c = self.kinect.depth_curve
-        angle = np.arange(2048) / b + c
-        table = np.where(angle < pi / 2, a * np.tan(angle), np.nan)
-        table[2047] = np.nan
-        table[table > 2 * self.kinect.max_range_m] = np.nan
+        eye = self.eye
+        codes = np.arange(eye.no_depth_code + 1)
+        if eye.depth == "none":
+            return np.full(len(codes), np.nan, dtype=np.float32)
+        if eye.depth == "mm":
+            table = np.maximum(codes / 1000.0, max(eye.min_range_m / 2, 0.05))  # nothing nearer is ever measured
+        else:
+            a, b, c = eye.curve
+            angle = codes / b + c
+            table = np.where(angle < pi / 2, a * np.tan(angle), np.nan)
+        table[-1] = np.nan
+        table[table > 2 * eye.max_range_m] = np.nan
         return table.astype(np.float32)
 
 

@@ -111,8 +111,8 @@ def body_of_parts(robot: Robot) -> SimBody:
     base = robot.base
     parts: dict[str, list[Part]] = {}
     extras: list[Extra] = []
-    if robot.kinect.mount is not None:
-        low, high = np.array(robot.kinect.mount)
+    if robot.eye.mount is not None:
+        low, high = np.array(robot.eye.mount)
         x, y, z = ((low + high) / 2).tolist()
         mass_kg = robot.solid.mount_mass_kg
         parts[MOUNT] = [Part(MOUNT, MOUNT, "box", tuple((high - low).tolist()), rgb=_WHITE, mass_kg=mass_kg)]

@@ -1,4 +1,4 @@
-"""The simulated Kinect: turns rendered images into what the sensor would deliver.
+"""The simulated Kinect, or another such camera: turns rendered images into what the sensor would deliver.
 
 `ideal` sensors only quantise. `real` ones add the sensor's errors: each is one function here or in `sensor_effects`,
 its strength a constant with its source. Random draws depend only on the run's seed and the frame's stamp, so a frame
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Robot
@@ -22,6 +22,8 @@ from sim.memory import keep_freed_memory
 from sim.render import Lighting, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (
+    EDGE_CODES,
+    EDGE_MM,
     ByteNoise,
     DepthCoder,
     DepthNoise,
@@ -100,9 +102,11 @@ class SimKinect:
         self._width, self._height = width, height
         self._real = sensors == "real"
         self._seed = seed
-        self._depth_offset_m = np.array(robot.kinect.depth_offset_m)
-        self._projector_offset_m = np.array(robot.kinect.projector_offset_m)
-        self._coder = DepthCoder(robot)
+        self._depth_offset_m = np.array(robot.eye.depth_offset_m)
+        self._projector_offset_m = np.array(robot.eye.projector_offset_m)
+        self._no_data = robot.eye.no_depth_code
+        self._edge = EDGE_MM if robot.eye.depth == "mm" else EDGE_CODES
+        self._coder = DepthCoder(robot) if robot.sees_depth else None
         self._before: tuple[int, FloatArray] | None = None
         keep_freed_memory()
         if self._real:
@@ -133,20 +137,19 @@ class SimKinect:
             light,
             moved(camera_pose, self._projector_offset_m) if self._real else None,
         )
-        if self._real:
-            rng = stream(self._seed, f"kinect frame {stamp_ns}")
+        rng = stream(self._seed, f"kinect frame {stamp_ns}") if self._real else None
+        if rng is not None:
             colour = self._expose(images.colour, images.depth_m, camera_pose, stamp_ns, rng)
-            depth = self._measure(images.depth_m, rng)
         else:
             colour = images.colour.copy()
-            depth = self._coder.codes(images.depth_m)
+        depth = self._depth(images.depth_m, rng)
         self._before = (stamp_ns, camera_pose.copy())
         return Frame(
             stamp_ns=stamp_ns,
             width=self._width,
             height=self._height,
             colour=colour.reshape(-1).data,
-            depth=depth.astype("<u2", copy=False).reshape(-1).view(np.uint8).data,
+            depth=depth,
         )
 
     def _expose(
@@ -168,10 +171,18 @@ class SimKinect:
         gains = np.array([exposure * (1 + balance), exposure, exposure * (1 - balance)])
         return self._errors.colour_noise.add(scale_channels(colour, gains), rng)
 
-    def _measure(self, depth_m: Float32Array, rng: np.random.Generator) -> CodeArray:
-        """Convert depth (height, width), m, to the depth camera's codes: noise is added before quantising; there is no
-        data out of range, in the projector's shadow (negative metres) and for some pixels on edges."""
-        return drop_edges(self._coder.codes(self._errors.depth_noise.add(depth_m, rng)), rng)
+    def _depth(self, depth_m: Float32Array, rng: np.random.Generator | None) -> memoryview:
+        """The depth of a `Frame`, of depth (height, width), m: noise is added before quantising; there is no data out
+        of range, in the projector's shadow (negative metres) and for some pixels on edges. Without `rng` it is only
+        quantised."""
+        if self._coder is None:
+            return memoryview(b"")
+        if rng is None:
+            codes = self._coder.codes(depth_m)
+        else:
+            codes = self._coder.codes(self._errors.depth_noise.add(depth_m, rng))
+            codes = drop_edges(codes, rng, self._no_data, self._edge)
+        return codes.astype("<u2", copy=False).reshape(-1).view(np.uint8).data
 
 
 def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:

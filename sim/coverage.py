@@ -51,7 +51,7 @@ class CoverageJudge:
     def __init__(self, robot: Robot, scene: Scene, radius_m: float) -> None:
         self._robot, self._scene, self._radius_m = robot, scene, radius_m
         self._chain = robot.camera_chain
-        self._depth_offset_m = np.array(robot.kinect.depth_offset_m)
+        self._depth_offset_m = np.array(robot.eye.depth_offset_m)
         self._start: FloatArray | None = None
         self._cells_m = np.zeros((0, 2))
         self._seen = np.zeros(0, dtype=bool)
@@ -96,7 +96,7 @@ class CoverageJudge:
         points = np.column_stack([cells_m, np.zeros(len(cells_m))])
         local = (points - eye) @ pose[:3, :3]
         z = np.maximum(local[:, 2], 1e-6)
-        camera, kinect = self._robot.camera, self._robot.kinect
+        camera, kinect = self._robot.camera, self._robot.eye
         u, v = camera.cx + camera.fx * local[:, 0] / z, camera.cy + camera.fy * local[:, 1] / z
         seen: BoolArray = (local[:, 2] >= kinect.min_range_m) & (local[:, 2] <= kinect.max_range_m)
         seen &= (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
@@ -168,7 +168,7 @@ class CoverageJudge:
         for place in reached:
             left = np.flatnonzero(~seeable)
             away = np.hypot(*(cells_m[left] - place).T)
-            left = left[(away >= LEAST_M) & (away <= self._robot.kinect.max_range_m - 0.2)]
+            left = left[(away >= LEAST_M) & (away <= self._robot.eye.max_range_m - 0.2)]
             points = np.column_stack([cells_m[left], np.zeros(len(left))])
             seeable[left] = ~self._hidden(self._newest, np.array([*place, EYE_M]), points)
         return seeable

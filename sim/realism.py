@@ -127,7 +127,7 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
         rows[name]["offset_deg"] += float(rng.uniform(-ZERO_DEG, ZERO_DEG))
     shift_m = _direction(rng) * rng.uniform(0.0, CAMERA_M)
     turn_rad = _direction(rng) * radians(rng.uniform(0.0, CAMERA_DEG))
-    camera = rows[robot.kinect.link]
+    camera = rows[robot.eye.link]
     data["link"] = [row for row in data["link"] if row is not camera]
     for row in _displacement("camera_mount_worn", camera["parent"], shift_m, turn_rad):
         data["link"].append(row)

@@ -13,12 +13,15 @@ from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray, media
 from cocoro.robot import Camera, Robot
 
 NO_DATA = 2047
+"""A Kinect's code of no data."""
 STEPS_PER_M = 16_000
 """Resolution of the coder's table: a twelfth of the smallest step of the depth codes (0.75 mm at 0.5 m)."""
 EDGE_CODES = 8
 """Difference of neighbouring depth codes that makes an edge: 8 codes are 5 cm at 1.5 m. The floor seen from the
 Kinect's height changes by less than 1 code per row at any distance, since both the codes and the rows of a plane are
 linear in 1 / z."""
+EDGE_MM = 50
+"""The same in millimetres."""
 EDGE_LOSS = 0.02
 """Share of edge pixels that have no data."""
 MOST_STAGES = 6
@@ -34,7 +37,7 @@ class DepthCoder:
         self._top_m = np.float32(last / STEPS_PER_M)
 
     def codes(self, depth_m: Float32Array) -> CodeArray:
-        """Codes (height, width) of depths, m; 2047 for depths out of range, infinity and negative metres."""
+        """Codes (height, width) of depths, m; that of no data for depths out of range, infinity and negative metres."""
         steps = np.clip(depth_m, np.float32(0), self._top_m)
         steps *= np.float32(STEPS_PER_M)
         steps += np.float32(0.5)
@@ -151,12 +154,13 @@ def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32A
     return _mean(_warped(image, at(first)), _warped(image, at(first + 0.5)))
 
 
-def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
+def drop_edges(codes: CodeArray, rng: np.random.Generator, no_data: int = NO_DATA, edge: int = EDGE_CODES) -> CodeArray:
     """Remove the data of 2 percent of the pixels (height, width) at depth edges (next to a much nearer or farther
-    pixel, or to one without data). Changes and returns its argument."""
+    pixel, or to one without data). Changes and returns its argument. `edge`: difference of neighbouring codes that
+    makes one."""
     spread = cv2.morphologyEx(codes, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
-    edges = np.flatnonzero(spread > EDGE_CODES)
-    codes.reshape(-1)[edges[rng.random(edges.size) < EDGE_LOSS]] = NO_DATA
+    edges = np.flatnonzero(spread > edge)
+    codes.reshape(-1)[edges[rng.random(edges.size) < EDGE_LOSS]] = no_data
     return codes
 
 

@@ -274,7 +274,7 @@ class World:
     def view(self) -> tuple[FloatArray, FloatArray]:
         """`visual_poses` and `camera_pose` now: the links' poses, of which both are made, are computed once."""
         links = self._mechanism.link_poses()
-        return self._visual_poses(links), self._link_pose(links, self.robot.kinect.link)
+        return self._visual_poses(links), self._link_pose(links, self.robot.eye.link)
 
     def visual_poses(self) -> FloatArray:
         """World poses of `visuals` now, in their order, (n, 4, 4)."""
@@ -282,7 +282,7 @@ class World:
 
     def camera_pose(self) -> FloatArray:
         """World pose of the camera, (4, 4); its frame is x right, y down, z forward."""
-        return self.link_pose(self.robot.kinect.link)
+        return self.link_pose(self.robot.eye.link)
 
     def link_pose(self, link: str) -> FloatArray:
         """World pose of a link of the robot description, (4, 4)."""

@@ -20,7 +20,7 @@ class ArmShape:
         parts = body_of_parts(robot).parts
         self._points = {link: np.vstack([_surface(part) for part in parts[link] if part.solid]) for link in LINKS}
         self._chains = {link: robot.chain(link) for link in LINKS}
-        self._low, self._high = np.array(robot.kinect.mount_min_m), np.array(robot.kinect.mount_max_m)
+        self._low, self._high = np.array(robot.eye.mount_min_m), np.array(robot.eye.mount_max_m)
 
     def points(self, angles_rad: Mapping[str, float]) -> FloatArray:
         """Positions of the points in the body frame, (n, 3), m."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
-from cocoro.description_limbs import LensValues
+from cocoro.cameras import LensValues
 from cocoro.units import Vec3
 from services.kinect.calibration import Board
 from services.kinect.lens import Lens

@@ -81,14 +81,16 @@ class Room:
             depth = depth + self._draws.normal(size=depth.shape) * self.noise * depth**2
         raw = ROBOT.depth_code(depth)
         image = RgbdImage(np.zeros((HEIGHT, WIDTH, 3), np.uint8), raw, ROBOT)
-        seen = self._scanner.scan(self._scanner.sample(image), WIDTH, HEIGHT, pose)
+        grid = self._scanner.sample(image)
+        assert grid is not None
+        seen = self._scanner.scan(grid, WIDTH, HEIGHT, pose)
         seen.stamp_ns, seen.nearest = self.now_ns, self._scanner.nearest(image)
         return seen
 
     def _depth(self, pose: FloatArray, body: Pose2) -> FloatArray:
         c, s = np.cos(body.yaw_rad), np.sin(body.yaw_rad)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        origin = turn @ (pose[:3, 3] + pose[:3, :3] @ np.array(ROBOT.kinect.depth_offset_m))
+        origin = turn @ (pose[:3, 3] + pose[:3, :3] @ np.array(ROBOT.eye.depth_offset_m))
         origin = origin + np.array([body.x_m, body.y_m, 0.0])
         rays = self._rays @ (turn @ pose[:3, :3]).T
         with np.errstate(divide="ignore", invalid="ignore"):

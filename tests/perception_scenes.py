@@ -54,7 +54,7 @@ class Canvas:
         left, right = round(centre_px[0] - half[0]), round(centre_px[0] + half[0])
         top, bottom = max(round(centre_px[1] - half[1]), 0), round(centre_px[1] + half[1])
         self.colour[top:bottom, max(left, 0) : right] = np.round(255 * np.array(known.rgb) * 0.8)
-        shift = round(-self.camera.fx * ROBOT.kinect.depth_offset_m[0] / apparent_m)
+        shift = round(-self.camera.fx * ROBOT.eye.depth_offset_m[0] / apparent_m)
         depth = np.nan if depth_m is None else depth_m
         self.depth_m[top:bottom, max(left + shift, 0) : max(right + shift, 0)] = depth
 

@@ -61,9 +61,9 @@ def look(
     images = renderer.render(
         poses,
         pose,
-        moved(pose, np.array(ROBOT.kinect.depth_offset_m)),
+        moved(pose, np.array(ROBOT.eye.depth_offset_m)),
         light or Lamp(),
-        moved(pose, np.array(ROBOT.kinect.projector_offset_m)) if projector else None,
+        moved(pose, np.array(ROBOT.eye.projector_offset_m)) if projector else None,
     )
     return Images(images.colour.copy(), images.depth_m.copy())
 

@@ -93,7 +93,7 @@ def test_ideal_depth_is_the_formulas_code() -> None:
     agree = codes == formula
     assert agree.mean() > 0.99
     assert np.abs(codes - formula)[formula != NO_DATA].max() <= 1  # on the border between two codes
-    a, b, c = ROBOT.kinect.depth_curve
+    a, b, c = ROBOT.eye.curve
     exact = b * (np.arctan(depth.astype(float) / a) - c)
     assert np.abs(codes - exact)[(depth > 0.501) & (depth < 3.499)].max() < 0.55
     assert (codes[(depth < 0.4999) | (depth > 3.5001)] == NO_DATA).all()
@@ -117,7 +117,7 @@ def test_an_ideal_frame_asks_for_no_projector_a_real_one_for_the_kinects_own() -
     none, projector = painted.projected
     assert none is None
     assert projector is not None
-    np.testing.assert_allclose(projector[:3, 3], [0.0, ROBOT.kinect.projector_offset_m[0], 0.0], atol=1e-12)
+    np.testing.assert_allclose(projector[:3, 3], [0.0, ROBOT.eye.projector_offset_m[0], 0.0], atol=1e-12)
 
 
 def test_a_frame_is_the_message_with_its_stamp_and_keeps_its_pixels() -> None:
@@ -214,7 +214,7 @@ def test_a_moving_camera_is_blurred_but_not_after_a_gap_or_a_step_back_in_time()
 def test_depth_noise_grows_with_the_square_of_the_distance(z_m: float) -> None:
     codes = depth_of(shoot(kinect(Painted(depth_m=z_m))))
     read = ROBOT.depth_m(codes[codes != NO_DATA]).astype(float)
-    a, b, _ = ROBOT.kinect.depth_curve
+    a, b, _ = ROBOT.eye.curve
     step_m = (z_m**2 + a**2) / (a * b)  # of the code at this depth; quantising adds step^2 / 12
     sigma_m = 0.0015 * z_m**2
     assert read.mean() == pytest.approx(z_m, abs=0.1 * step_m)
@@ -295,7 +295,7 @@ def test_both_frame_sizes_show_the_can_where_it_is(size: tuple[int, int]) -> Non
     assert v.mean() == pytest.approx(camera_.fy * y / z + camera_.cy, abs=3)
     ray = camera_.ray(u.mean(), v.mean())
     assert abs(np.cross(ray / np.linalg.norm(ray), [x, y, z])).max() < 0.012  # the ray passes the can's middle
-    depth_pose = moved(pose, np.array(ROBOT.kinect.depth_offset_m))
+    depth_pose = moved(pose, np.array(ROBOT.eye.depth_offset_m))
     x, y, z, _ = np.linalg.inv(depth_pose) @ [1.2, 0.2, 0.06, 1.0]
     code = depth_of(frame)[round(camera_.fy * y / z + camera_.cy), round(camera_.fx * x / z + camera_.cx)]
     assert ROBOT.depth_m(code) == pytest.approx(z - 0.03, abs=0.02)

@@ -35,7 +35,7 @@ def test_points_stand_where_the_depth_says() -> None:
     colour = np.full((12, 16, 3), 7, dtype=np.uint8)
     frame = Frame(width=16, height=12, colour=memoryview(colour.tobytes()), depth=memoryview(depth.tobytes()))
     places, colours = points(frame, ROBOT, 1)
-    ray = ROBOT.camera.scaled(16, 12).ray(8, 6) * 1.5 + np.array(ROBOT.kinect.depth_offset_m)
+    ray = ROBOT.camera.scaled(16, 12).ray(8, 6) * 1.5 + np.array(ROBOT.eye.depth_offset_m)
     assert places == pytest.approx(ray.reshape(1, 3), abs=0.01)
     assert colours.tolist() == [[7, 7, 7]]
 
@@ -54,4 +54,4 @@ def test_the_links_are_known_once_every_joint_is() -> None:
 def test_robot_and_objects_are_those_that_the_capture_has() -> None:
     with Capture.open(GOLDEN) as capture:
         assert "red_can" in catalogue_of(capture)
-        assert robot_of(capture).kinect == ROBOT.kinect
+        assert robot_of(capture).eye == ROBOT.eye

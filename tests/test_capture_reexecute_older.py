@@ -93,6 +93,7 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: mood is gone: ignored",
         "calliope/planning/status: model is new: gets its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: gets its default",
+        "calliope/perception/detections: Detection.sigma_m is new: gets its default",
         "calliope/executive/intent: Intent has changed: its former shape is converted",
         "calliope/base/state: aside_mps is new: gets its default",
         "calliope/base/command: BaseCommand has changed: its former shape is converted",

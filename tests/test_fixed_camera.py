@@ -218,7 +218,7 @@ def test_a_sweep_shows_every_direction_once(fixed: Robot, gaze: BaseAsNeck) -> N
     assert aims[0] == pytest.approx(2.0)
     for bearing in np.linspace(-pi, pi, 40):
         off = min(abs((bearing - aim + pi) % (2 * pi) - pi) for aim in aims)
-        assert off < fixed.kinect.horizontal_fov_rad / 2
+        assert off < fixed.eye.horizontal_fov_rad / 2
 
 
 def test_looking_at_parts_of_the_floor_turns_the_body_to_each(gaze: BaseAsNeck) -> None:

@@ -60,7 +60,7 @@ GOOD = pack(frame_of(np.arange(48, dtype="<u2").reshape(6, 8)))
         ({"colour": GOOD.colour[:200]}, "colour"),
         ({"width": 6, "height": 8}, "8 x 6, not 6 x 8"),
         ({"colour": pack(frame_of(np.zeros((60, 80), "<u2"))).colour}, "80 x 60"),
-        ({"depth": b""}, "depth"),
+        ({"depth": b"\x00"}, "depth"),
         ({"depth": GOOD.depth[:-4]}, "depth"),
         ({"depth": b"foreign" * 9}, "depth"),
         ({"depth": zstandard.compress(bytes(95))}, "95 bytes, 96 are expected"),

@@ -101,7 +101,7 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
     found: Calibration, painter: Painter, tmp_path: Path
 ) -> None:
     file = tmp_path / "measured.toml"
-    write_values(file, "kinect", found.values())
+    write_values(file, "camera", found.values(), "kinect")
     robot = Robot.load(None, file)
     rotation, origin = lying((0.3, -0.4, 0.1), (0.1, 0.05, 0.9), BOARD)
     shot = RawFrame(7, painter.colour(rotation, origin), painter.depth(rotation, origin))
@@ -117,10 +117,11 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
     off_px = min(np.linalg.norm(order - wanted, axis=1).max() for order in (corners, corners[::-1]))
     assert off_px < 1.0
     # As readers of frames assume: a pinhole beside the colour camera that looks in the same direction.
-    beside_m = points_m - robot.kinect.depth_offset_m
+    beside_m = points_m - robot.eye.depth_offset_m
     u, v = np.rint(Lens.of(robot.camera).pixels(beside_m)).astype(int).T
+    assert straight.depth is not None
     depth_m = robot.depth_m(straight.depth)[v, u]
-    a, b, _ = robot.kinect.depth_curve
+    a, b, _ = robot.eye.curve
     step_m = a / b * (1.0 + (beside_m[:, 2] / a) ** 2)
     assert np.median(np.abs(depth_m - beside_m[:, 2]) / step_m) < 1.0
 
@@ -177,7 +178,7 @@ def test_the_command_calibrates_from_kept_views_and_writes_the_robots_file(
     out = capsys.readouterr().out
     assert "7 views" in out
     assert 'measured = "calliope-measured.toml"' in out
-    kinect = Robot.load(None, tmp_path / "calliope-measured.toml").kinect
+    kinect = Robot.load(None, tmp_path / "calliope-measured.toml").eye
     assert kinect.colour_lens is not None
     assert kinect.colour_lens[0] == pytest.approx(EYES.colour[0], rel=0.02)
     assert kinect.depth_lens is not None

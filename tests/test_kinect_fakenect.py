@@ -120,6 +120,7 @@ def play(
 def number_of(shot: RawFrame, colours: list[bytes], depths: list[bytes]) -> int:
     """The number of the frame in the recording. Its colour and depth must be complete, and of the same moment."""
     number = colours.index(shot.colour.tobytes())
+    assert shot.depth is not None
     assert shot.depth.astype("<u2").tobytes() == depths[number]
     return number
 
@@ -201,7 +202,7 @@ def test_perception_finds_the_recorded_objects_where_they_stand(
 def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, tmp_path: Path) -> None:
     board, robot = Board(8, 6, 0.04), Robot.load()
     lens = (robot.camera.fx, robot.camera.fy, robot.camera.cx, robot.camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0)
-    painter = Painter(Eyes(lens, lens, (0.0, 0.0, 0.0), robot.kinect.depth_offset_m, robot.kinect.depth_curve), board)
+    painter = Painter(Eyes(lens, lens, (0.0, 0.0, 0.0), robot.eye.depth_offset_m, robot.eye.curve), board)
     poses = [lying((0.2, 0.3 * side, 0.0), (0.1 * side, 0.0, 0.8), board) for side in (-1, 1)]
     pictures = [(painter.colour(*pose), painter.depth(*pose)) for pose in poses]
     with RecordingWriter(tmp_path / "recording") as writer:
@@ -230,5 +231,5 @@ def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tm
 def depth_step_m(robot: Robot, place_m: list[float]) -> float:
     """Depth step of one code at a place in the body frame, m: the camera is about 0.7 m above the floor."""
     away_m = float(np.linalg.norm(np.array(place_m) - [0.06, 0.0, 0.7]))
-    a, b, _ = robot.kinect.depth_curve
+    a, b, _ = robot.eye.curve
     return a / b * (1.0 + (away_m / a) ** 2)

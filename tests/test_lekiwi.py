@@ -177,7 +177,7 @@ def test_it_stands_moves_every_joint_and_drives_in_every_direction(lekiwi: Robot
         assert yaw_of(truth) > 0.8
 
 
-def fetched(tmp_path: Path, radius_m: float, height_m: float) -> dict[str, Any]:
+def fetched(tmp_path: Path, radius_m: float, height_m: float, description: str = "lekiwi") -> dict[str, Any]:
     """The result of fetching a can of this size."""
     text = resources.files("cocoro").joinpath("objects.toml").read_text(encoding="utf-8")
     size = f"radius_m = {radius_m}\nheight_m = {height_m}"
@@ -186,7 +186,7 @@ def fetched(tmp_path: Path, radius_m: float, height_m: float) -> dict[str, Any]:
     objects.write_text(text.replace("radius_m = 0.033\nheight_m = 0.120", size), encoding="utf-8")
     return rehearse(
         RehearsalRequest(
-            task=asked("fetch", "red_can").task, scene=str(scene), description="lekiwi", objects=str(objects),
+            task=asked("fetch", "red_can").task, scene=str(scene), description=description, objects=str(objects),
             width=320, height=240, frame_rate_hz=15.0,
         )
     )  # fmt: skip

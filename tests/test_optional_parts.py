@@ -71,17 +71,17 @@ def test_a_hand_without_a_marker_is_not_learned_from_sight(bare: Robot) -> None:
 
 def test_a_description_without_a_part_is_recorded_as_it_is(bare: Robot) -> None:
     again = Robot.from_data(bare.to_data())
-    assert (again.marker, again.kinect.mount, again.hull.kinect) == (None, None, None)
+    assert (again.marker, again.eye.mount, again.hull.kinect) == (None, None, None)
 
 
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        (without_line(DESCRIPTION, "mount_max_m"), r"kinect\.mount_min_m: a box has two corners, and one of them is"),
+        (without_line(DESCRIPTION, "mount_max_m"), r"camera kinect: mount_min_m: a box has two corners"),
         (without_line(DESCRIPTION, "kinect_min_m"), r"hull\.kinect_min_m: a box has two corners, and one of them is"),
-        (without_table(DESCRIPTION, "head"), r"the joint 'neck_pan' turns the camera, but there is no \[head\]"),
-        (DESCRIPTION.replace('pan = "neck_pan"', 'pan = "neck_tilt"'), "'neck_pan' turns the camera, which is none of"),
-        (DESCRIPTION.replace('tilt = "neck_tilt"', 'tilt = "arm_base"'), "'neck_tilt' turns the camera, which is none"),
+        (without_table(DESCRIPTION, "head"), r"the joint 'neck_pan' turns it, but there is no \[head\]"),
+        (DESCRIPTION.replace('pan = "neck_pan"', 'pan = "neck_tilt"'), "'neck_pan' turns it, which is none of"),
+        (DESCRIPTION.replace('tilt = "neck_tilt"', 'tilt = "arm_base"'), "'neck_tilt' turns it, which is none"),
         (without_neck().replace("[marker]", '[head]\npan = "arm_base"\ntilt = "elbow"\n\n[marker]'),
          "head: the joint 'arm_base' does not turn the camera"),
     ],

@@ -77,7 +77,7 @@ def swept(pan: float) -> list[tuple[float, float]]:
 
 @pytest.mark.parametrize("start_pan", [-2.6, -0.4, 0.0, 0.4, 2.6])
 def test_the_pictures_of_a_sweep_show_the_floor_in_every_direction_from_near_to_far(start_pan: float) -> None:
-    half_wide, half_high = ROBOT.kinect.horizontal_fov_rad / 2, ROBOT.kinect.vertical_fov_rad / 2
+    half_wide, half_high = ROBOT.eye.horizontal_fov_rad / 2, ROBOT.eye.vertical_fov_rad / 2
     aims = swept(start_pan)
     for bearing in np.linspace(-2.6 - half_wide, 2.6 + half_wide, 60):
         tilts = [tilt for pan, tilt in aims if abs(bearing - pan) <= half_wide + 1e-9]

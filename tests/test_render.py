@@ -37,7 +37,7 @@ pytestmark = pytest.mark.sim
 
 
 def test_a_pixel_shows_what_its_ray_hits(renderer: Renderer) -> None:
-    depth_pose = moved(head(), np.array(ROBOT.kinect.depth_offset_m))
+    depth_pose = moved(head(), np.array(ROBOT.eye.depth_offset_m))
     expected = floor_depth(CAMERA, depth_pose)
     error = np.abs(look(renderer).depth_m - expected)
     bare = np.zeros(error.shape, bool)
@@ -89,7 +89,7 @@ def test_the_depth_camera_sees_from_its_own_place(gl: Renderer) -> None:
 def test_the_surface_is_where_the_primitive_ends(renderer: Renderer) -> None:
     pose = head()
     for visual, place, toward in ((BLUE_BOX, PLACES[1], 0.1), (GREEN_BALL, PLACES[2], 0.05)):
-        depth_pose = moved(pose, np.array(ROBOT.kinect.depth_offset_m))
+        depth_pose = moved(pose, np.array(ROBOT.eye.depth_offset_m))
         centre = np.array(place)
         if visual.shape == "box":
             surface = centre - [toward, 0.0, 0.0]
@@ -229,4 +229,4 @@ def test_walls_that_no_shadow_reaches_look_as_if_their_shadows_were_looked_up(
     np.testing.assert_array_equal(quick.colour, whole.colour)
     np.testing.assert_array_equal(np.abs(quick.depth_m), np.abs(whole.depth_m))
     differs = np.signbit(quick.depth_m) != np.signbit(whole.depth_m)
-    assert not (differs & (whole.depth_m > -ROBOT.kinect.max_range_m)).any()
+    assert not (differs & (whole.depth_m > -ROBOT.eye.max_range_m)).any()

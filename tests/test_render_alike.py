@@ -42,7 +42,7 @@ def test_without_a_projector_depth_has_no_shadows(renderer: Renderer) -> None:
 def test_the_projectors_shadow_lies_left_of_a_near_thing_as_wide_as_the_disparity(renderer: Renderer) -> None:
     # The projector is to the right of the depth camera, so the area without light is to the left.
     images = look(renderer, projector=True)
-    u, v = pixel_of((1.8 - 0.1, 0.4, 0.2), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
+    u, v = pixel_of((1.8 - 0.1, 0.4, 0.2), moved(head(), np.array(ROBOT.eye.depth_offset_m)))
     row = images.depth_m[round(v)]
     shaded = np.flatnonzero(row[: round(u)] < 0)
     box_m = row[round(u)]
@@ -129,7 +129,7 @@ def test_any_resolution_shows_the_same_view(gl: Renderer) -> None:
     coarse = look(small).depth_m
     fine = look(gl).depth_m
     small.close()
-    u, v = pixel_of((1.7, 0.4, 0.15), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
+    u, v = pixel_of((1.7, 0.4, 0.15), moved(head(), np.array(ROBOT.eye.depth_offset_m)))
     assert coarse[round((v - 0.5) / 2), round((u - 0.5) / 2)] == pytest.approx(fine[round(v), round(u)], abs=0.01)
 
 

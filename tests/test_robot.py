@@ -120,7 +120,7 @@ def test_a_depth_comes_back_within_a_step_of_the_code(depth_m: float) -> None:
 @given(code=st.integers(0, 2046))
 def test_a_code_comes_back_as_it_was(code: int) -> None:
     depth = ROBOT.depth_m(np.array([code], dtype=np.uint16))
-    if ROBOT.kinect.min_range_m <= depth[0] <= ROBOT.kinect.max_range_m:
+    if ROBOT.eye.min_range_m <= depth[0] <= ROBOT.eye.max_range_m:
         assert ROBOT.depth_code(depth.astype(float))[0] == code
 
 
@@ -209,7 +209,7 @@ def test_a_measured_tube_of_the_hull_changes_that_one_alone(tmp_path: Path) -> N
         ('[[hull.tube]]\nname = "forearm"\nend = "nowhere"\n', "hull.tube forearm: there is no link 'nowhere'"),
         ("[hull]\nfinger_turn_deg = { claw_middle = 1.0 }\n", "hull.finger_turn_deg: there is no link 'claw_middle'"),
         ("[hull]\nkinect_max_m = [0.13, -0.2, 0.79]\n", r"own\.toml: hull\.kinect_min_m: .* must be below"),
-        ("[kinect]\nmount_min_m = [0.0, 0.0, 9.0]\n", r"own\.toml: kinect\.mount_min_m: .* must be below"),
+        ("[kinect]\nmount_min_m = [0.0, 0.0, 9.0]\n", r"own\.toml: camera kinect: mount_min_m: .* must be below"),
     ],
 )
 def test_a_hull_or_mount_that_cannot_be_is_refused(tmp_path: Path, text: str, named: str) -> None:
@@ -221,7 +221,7 @@ def test_a_hull_or_mount_that_cannot_be_is_refused(tmp_path: Path, text: str, na
     ("text", "named"),
     [
         ('[arm]\ntip = "nowhere"\n', r"own\.toml: arm\.tip: there is no link 'nowhere'"),
-        ('[kinect]\nlink = "nowhere"\n', "kinect.link: there is no link 'nowhere'"),
+        ('[kinect]\nlink = "nowhere"\n', "camera kinect: link: there is no link 'nowhere'"),
         ('[arm]\nroll = "knuckle"\n', "arm: there is no joint 'knuckle'"),
         ('[head]\npan = "knuckle"\n', "head: there is no joint 'knuckle'"),
         ('[arm]\nbend = "neck_tilt"\n', "arm: bend = 'neck_tilt' is none of its joints arm_base, shoulder"),

@@ -68,7 +68,7 @@ def test_what_the_joints_are_for_follows_from_order_and_names(made: Made) -> Non
 
 def test_nothing_is_added_that_the_urdf_does_not_have(made: Made) -> None:
     robot = made.robot
-    assert (robot.head, robot.marker, robot.kinect.mount, robot.hull.kinect) == (None, None, None, None)
+    assert (robot.head, robot.marker, robot.eye.mount, robot.hull.kinect) == (None, None, None, None)
     assert set(robot.joints) == set(JOINTS)
     assert {joint.network for joint in robot.joints.values()} == {"bus"}
 
@@ -150,7 +150,7 @@ def test_the_written_description_is_read_as_it_was_made(made: Made, tmp_path: Pa
 def test_the_page_has_a_line_for_all_that_no_urdf_says(made: Made) -> None:
     page = page_text("desk", "desk.urdf", made.missing)
     assert page.index(NEVER) < page.index(GUESSED) < page.index(FILE)
-    for word in ("[base]", "IDs", "direction", "centre_count", "[kinect]", "[pose.*]", "command counts"):
+    for word in ("[base]", "IDs", "direction", "centre_count", "[[camera]]", "[pose.*]", "command counts"):
         assert word in page
     rows = [line for line in page.splitlines() if line.startswith("| ") and not line.startswith(("| what |", "| ---"))]
     assert len(rows) == len(made.missing)

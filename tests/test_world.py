@@ -192,7 +192,7 @@ def test_visuals_have_poses_and_the_marker_stands_where_the_description_puts_it(
     assert len(place) == len(poses)
     marker = empty.link_pose("wrist_roll") @ [*ROBOT.the_marker.position_m, 1.0]
     assert place["marker"][:3, 3] == pytest.approx(marker[:3], abs=1e-6)
-    low, high = np.array(ROBOT.kinect.mount_min_m), np.array(ROBOT.kinect.mount_max_m)
+    low, high = np.array(ROBOT.eye.mount_min_m), np.array(ROBOT.eye.mount_max_m)
     assert place["mount"][:3, 3] == pytest.approx((low + high) / 2, abs=5e-4)
 
 

@@ -39,7 +39,7 @@ def surface_depth_m(raw_depth: CodeArray, region: ObjectRegion, robot: Robot) ->
     """
     height, width = raw_depth.shape
     camera = robot.camera.scaled(width, height)
-    ox, oy, oz = robot.kinect.depth_offset_m
+    ox, oy, oz = robot.eye.depth_offset_m
     depth = robot.depth_m(raw_depth)
     rows, columns = np.nonzero(np.isfinite(depth))
     z = depth[rows, columns].astype(np.float64)

@@ -33,8 +33,6 @@ FRAME_S = 5.0
 """Longest wait for a frame and the head's angles."""
 STILL_RAD = 0.01
 """Largest change between two readings of the head; with more, the picture is blurred and the pose uncertain."""
-NO_DEPTH = 2047
-"""Code of a pixel without depth."""
 MS = 1_000_000
 OWN, OTHER, OUTLINE = (0, 255, 120), (255, 0, 60), (255, 255, 255)
 
@@ -62,10 +60,7 @@ def of_picture(path: Path, robot: Robot) -> CameraView:
     height, width = colour.shape[:2]
     if max(height, width) > 4096:
         raise ConfigError(f"{path} has {width} x {height} pixels; at most 4096 on each side are allowed")
-    depth = np.full(height * width, NO_DEPTH, dtype="<u2")
-    frame = Frame(
-        width=width, height=height, colour=colour.reshape(-1).data, depth=depth.view(np.uint8).data, stamp_ns=MS
-    )
+    frame = Frame(width=width, height=height, colour=colour.reshape(-1).data, depth=memoryview(b""), stamp_ns=MS)
     return CameraView(ObjectView(colour, robot), frame, None, None)
 
 
@@ -75,7 +70,9 @@ async def of_robot(choice: RobotChoice) -> CameraView:
         robot, catalogue = link.described(), link.catalogue_file()
         frame, head = await _frame(link, robot.camera_chain.joints)
     pose = robot.camera_chain.pose(head)
-    raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
+    raw_depth = None
+    if frame.has_depth:
+        raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
     object_view = ObjectView(colour_of(frame), robot, raw_depth, pose)
     return CameraView(object_view, frame, head, catalogue)
 

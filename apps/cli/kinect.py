@@ -89,7 +89,7 @@ def calibrate_from_views(
     found = calibration.calibrate(taken, board, robot)
     if not as_json:
         _print(found)
-    write_values(file, "kinect", found.values())
+    write_values(file, "camera", found.values(), robot.eye.name)
     tell(as_json, {"file": str(file), "views": found.views, "kinect": found.values()}, f"written to {file}")
     if not as_json and profile.measured is None:
         print(f'Name the file in the profile: measured = "{file}"')

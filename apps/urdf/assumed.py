@@ -89,8 +89,9 @@ def camera_of(roles: Roles, rows: Rows, body: Body) -> dict[str, Any]:
     if roles.camera is None or "optical" not in roles.camera.lower():
         pose[:3, :3] = pose[:3, :3] @ _TO_OPTICAL
     parent = BODY if roles.camera is None else rows.link[roles.camera]
-    table: dict[str, Any] = Robot.load().to_data()["kinect"] | {
-        "link": rows.add(rows.free("camera", "view"), parent, Origin.of(pose))
+    table: dict[str, Any] = Robot.load().to_data()["camera"][0] | {
+        "name": "camera",
+        "link": rows.add(rows.free("camera", "view"), parent, Origin.of(pose)),
     }
     for field in ("colour_lens", "depth_lens", "mount_min_m", "mount_max_m"):
         table.pop(field, None)

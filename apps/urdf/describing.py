@@ -61,7 +61,7 @@ def _described(urdf: Urdf, name: str) -> Made:
     )  # fmt: skip
     joints = [_joint(urdf, joint, roles) for joint in roles.joints]
     data: dict[str, Any] = {"name": name, "base": body.base(parts.mass_kg)}
-    data["kinect"] = camera_of(roles, rows, body)
+    data["camera"] = [camera_of(roles, rows, body)]
     if roles.head:
         data["head"] = {"pan": roles.head[0], "tilt": roles.head[1]}
     data["arm"] = {"joints": list(roles.arm), "bend": roles.bend, "roll": roles.roll, "tip": tip}

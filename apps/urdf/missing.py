@@ -57,7 +57,7 @@ def _never(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
             "a joint turns the wrong way, or its angles are off; `cocoro servos calibrate` measures zeros",
         ),
         Missing(
-            NEVER, "picture size, field of view and depth of the camera", "`[kinect]`", "a Kinect's",
+            NEVER, "picture size, field of view and depth of the camera", "`[[camera]]`", "a Kinect's",
             "what it sees is taken to be elsewhere",
         ),
         Missing(
@@ -79,7 +79,7 @@ def _never(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
         ),
         Missing(
             NEVER, "space of the camera and of what holds it up",
-            "`[kinect] mount_min_m`, `mount_max_m`, `[hull] kinect_min_m`, `kinect_max_m`", "none",
+            "`[[camera]] mount_min_m`, `mount_max_m`, `[hull] kinect_min_m`, `kinect_max_m`", "none",
             "the planner does not keep the arm off them",
         ),
     ]  # fmt: skip
@@ -166,14 +166,14 @@ def _guessed(roles: Roles, hand: Hand, body: Body, data: dict[str, Any]) -> list
         or f"none in the URDF: fixed on the body at {[round(value, 3) for value in body.camera_m]} m,"
         f" {CAMERA_DOWN_DEG:g} degrees down"
     )
-    where = "`[kinect] link`" if roles.camera else f"`[[link]]` {data['kinect']['link']}"
+    where = "`[[camera]] link`" if roles.camera else f"`[[link]]` {data['camera'][0]['link']}"
     rows.append(Missing(GUESSED, "the camera's place", where, camera, "what it sees is taken to be elsewhere"))
     idle = [name for name in roles.joints if name not in (*roles.arm, roles.roll, *roles.jaws, *roles.head)]
     if idle:
         rows.append(Missing(GUESSED, "what these joints are for", "`[arm]`", ", ".join(idle), "they hold still"))
     for doubt in roles.doubts:
         where, _, sentence = doubt.partition(": ")
-        so = "its pictures are not used" if where.startswith("[kinect]") else "reaching goes wrong"
+        so = "its pictures are not used" if where.startswith("[[camera]]") else "reaching goes wrong"
         rows.append(Missing(GUESSED, sentence, f"`{where}`", "as it is", so))
     return rows
 

@@ -98,7 +98,7 @@ def _camera(urdf: Urdf, wheels: set[str], limb: set[str], doubts: list[str]) -> 
             fit.append((link, above))
         else:
             doubts.append(
-                f"[kinect] link: the camera {link} is not used: {', '.join(above)} turn it, which are no head"
+                f"[[camera]] link: the camera {link} is not used: {', '.join(above)} turn it, which are no head"
             )
     fit.sort(key=lambda one: ("optical" not in one[0].lower(), bool(_HOLDER.search(one[0]))))
     return fit[0] if fit else (None, ())

@@ -11,7 +11,7 @@ from apps.urdf.missing import Missing
 PAGE = "WHAT-IS-MISSING.md"
 _TABLES = {
     "base": "What is not of the URDF's wheels is assumed. Safety times and acceleration are the Calliope's.",
-    "kinect": "Assumed: a Kinect's lens and depth.",
+    "camera": "Assumed: a Kinect's lens and depth.",
     "head": "The joints that turn the camera.",
     "arm": "Guessed from the joints' order and names.",
     "link": "From the URDF: places of its joints. A joint about another axis than z has two rows.",

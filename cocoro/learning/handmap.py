@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.cameras import CameraRow
 from cocoro.frames import Spherical, to_cartesian
 from cocoro.kinematics import turn_z
 from cocoro.learning.network import HyperplaneRbf
@@ -48,13 +49,27 @@ def fingerprint_of(robot: Robot) -> str:
         "base": [
             data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m", "wheel") if data["base"][name]
         ],
-        "kinect": {
-            field.name: data["kinect"][field.name]
-            for field in msgspec.structs.fields(robot.kinect)
-            if field.required or getattr(robot.kinect, field.name) != field.default
-        },
+        "kinect": _camera(robot.eye),
     }
     return hashlib.sha256(msgspec.json.encode(geometry, order="deterministic")).hexdigest()[:16]
+
+
+_OF_EVERY_CAMERA = (
+    "width", "height", "rate_hz", "horizontal_fov_rad", "vertical_fov_rad", "min_range_m", "max_range_m",
+    "depth_offset_m", "projector_offset_m", "depth_curve",
+)  # fmt: skip
+_FORMER = {"link": "camera", "depth": "kinect"}
+"""Values that had no field before, or were its default."""
+
+
+def _camera(row: CameraRow) -> dict[str, Any]:
+    """The camera's part of the fingerprint, in the form that descriptions with one camera had."""
+    defaults = {field.name: _FORMER.get(field.name, field.default) for field in msgspec.structs.fields(row)}
+    return {
+        name: value
+        for name, value in msgspec.to_builtins(row).items()
+        if name in _OF_EVERY_CAMERA or (name != "name" and getattr(row, name) != defaults[name])
+    }
 
 
 class NominalModel:

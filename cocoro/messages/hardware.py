@@ -14,21 +14,27 @@ STOPPED_BY: dict[LatchState, str] = {"released": "", "latched": "estop", "unknow
 
 
 class Frame(Message):
-    """One colour and depth pair of the Kinect. The pixels decode without a copy, as `memoryview`."""
+    """One picture of the camera by which the robot finds things: colour, and depth where that camera measures it. The
+    pixels decode without a copy, as `memoryview`."""
 
     width: Annotated[int, Meta(ge=1, le=4096)]
     height: Annotated[int, Meta(ge=1, le=4096)]
     colour: memoryview
     """RGB, 8 bits a channel, row-major: height x width x 3 bytes."""
     depth: memoryview
-    """Raw 11-bit depth codes as little-endian uint16, row-major: height x width x 2 bytes; 2047 = no data.
+    """Depth codes as little-endian uint16, row-major: height x width x 2 bytes; empty from a camera without depth. The
+    robot's description says what a code is: a Kinect's 11 bits, 2047 = no data, or millimetres, 65535 = no data.
     Seen from the depth camera; the reader registers it to the colour image."""
 
     def __post_init__(self) -> None:
         pixels = self.width * self.height
         for name, have, want in (("colour", self.colour.nbytes, 3 * pixels), ("depth", self.depth.nbytes, 2 * pixels)):
-            if have != want:
+            if have != want and (have or name != "depth"):
                 raise ValueError(f"{name} has {have} bytes, {self.width} x {self.height} needs {want}")
+
+    @property
+    def has_depth(self) -> bool:
+        return self.depth.nbytes > 0
 
 
 class PackedRequest(msgspec.Struct, kw_only=True):
@@ -54,7 +60,7 @@ class PackedFrame(msgspec.Struct, kw_only=True):
     colour: bytes
     """JPEG."""
     depth: bytes
-    """The codes of a `Frame`, by zstd."""
+    """The codes of a `Frame`, by zstd; empty where it has none."""
     held_s: FiniteNonNegative = 0.0
     """How long the packer held the question: until there was a frame, and while it packed that."""
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Message
+from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, FiniteVec3, Message
 
 
 class Detection(msgspec.Struct, kw_only=True):
@@ -25,6 +25,10 @@ class Detection(msgspec.Struct, kw_only=True):
     position_m: FiniteVec3 | None = None
     """The object's centre (the visible surface moved inwards by the known radius) in the body frame at the frame's
     stamp; None without depth or without head angles for that stamp."""
+    sigma_m: FiniteNonNegative | None = None
+    """Standard deviation of the position along the line of sight, where it was found by colour alone: of what is alike
+    from picture to picture, too, so that more pictures do not make it smaller. None of a position by depth, whose
+    error the planner's settings have."""
     note: str = ""
     """Why the position is missing or doubtful: 'no depth', 'no head angles', 'occluded', 'cut'."""
 

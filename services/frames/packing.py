@@ -25,14 +25,15 @@ def pack(frame: Frame, divisor: int = 1, quality: int = 90) -> PackedFrame:
     A frame whose sides are no multiples of the divisor stays as large as it is.
     """
     colour = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
-    depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
+    depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width) if frame.has_depth else None
     if divisor > 1 and frame.width % divisor == 0 and frame.height % divisor == 0:
         size = frame.width // divisor, frame.height // divisor
         colour = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        depth = np.ascontiguousarray(depth[divisor // 2 :: divisor, divisor // 2 :: divisor])
+        if depth is not None:
+            depth = np.ascontiguousarray(depth[divisor // 2 :: divisor, divisor // 2 :: divisor])
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), options)
-    height, width = depth.shape
+    height, width = colour.shape[:2]
     return PackedFrame(
         stamp_ns=frame.stamp_ns,
         seq=frame.seq,
@@ -40,7 +41,7 @@ def pack(frame: Frame, divisor: int = 1, quality: int = 90) -> PackedFrame:
         width=width,
         height=height,
         colour=jpeg.tobytes(),
-        depth=zstandard.ZstdCompressor(level=DEPTH_LEVEL).compress(depth.tobytes()),
+        depth=b"" if depth is None else zstandard.ZstdCompressor(level=DEPTH_LEVEL).compress(depth.tobytes()),
     )
 
 
@@ -54,7 +55,7 @@ def unpack(packed: PackedFrame) -> Frame:
     if bgr is None or bgr.shape != (packed.height, packed.width, 3):
         raise ValueError("colour: OpenCV cannot decode it")
     colour = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    depth = _unpacked_depth(packed.depth, 2 * packed.width * packed.height)
+    depth = _unpacked_depth(packed.depth, 2 * packed.width * packed.height) if packed.depth else b""
     return Frame(
         stamp_ns=packed.stamp_ns,
         seq=packed.seq,

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, CodeArray, Float32Array, FloatArray, ImageArray
-from cocoro.description_limbs import LensValues
+from cocoro.cameras import LensValues
 from cocoro.errors import CocoroError
 from cocoro.robot import Robot
 from cocoro.units import Vec3
@@ -100,7 +100,7 @@ class Calibration:
     views: int
 
     def values(self) -> dict[str, float | tuple[float, ...]]:
-        """The values for the table [kinect] of a robot's own file."""
+        """The values for the row of the camera in a robot's own file."""
         names = (
             "horizontal_fov_rad", "vertical_fov_rad", "depth_offset_m", "depth_curve", "colour_lens", "depth_lens",
             "depth_rotation_rad",
@@ -238,8 +238,8 @@ class _DepthFit:
 
     def __init__(self, views: Sequence[BoardView], boards: Sequence[_BoardPose], board: Board, robot: Robot) -> None:
         self._views, self._boards, self._board = views, boards, board
-        kinect = robot.kinect
-        a, b, c = kinect.depth_curve
+        kinect = robot.eye
+        a, b, c = kinect.curve
         self._a = a
         scale = a * b
         middle = (kinect.width - 1) / 2, (kinect.height - 1) / 2

@@ -23,6 +23,7 @@ from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
 from services.kinect.device import DepthCamera, DriverFactory, KinectConfig, OnFault, RawFrame
 from services.kinect.freenect import HEIGHT, LED, WIDTH, ImageKind
+from services.kinect.uvc import UvcCamera
 
 log = logging.getLogger("cocoro.kinect")
 
@@ -185,7 +186,7 @@ class FreenectCamera:
             self._grabber.send(json.dumps(message).encode())
 
 
-DRIVERS: Mapping[str, DriverFactory] = {"freenect": FreenectCamera}
+DRIVERS: Mapping[str, DriverFactory] = {"freenect": FreenectCamera, "uvc": UvcCamera}
 """Drivers by the name that `device` in the service's settings chooses."""
 
 

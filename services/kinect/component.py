@@ -6,7 +6,7 @@ from cocoro.topics import FRAME
 KINECT = Component(
     name="kinect",
     module="services.kinect.service",
-    doc="The Kinect: colour and raw depth.",
+    doc="The Kinect, or another camera: colour, and depth where it has any.",
     publishes=(FRAME,),
     hardware=True,
     frames="publishes",

@@ -1,4 +1,4 @@
-"""The interface of a depth camera's driver, and the settings of the Kinect service."""
+"""The interface of a camera's driver, and the settings of the camera's service, `kinect`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,16 @@ OnFault = Callable[[str], None]
 
 
 class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The settings of the Kinect service."""
+    """The settings of the camera's service."""
 
     device: str = "freenect"
-    """Name of the driver."""
+    """Name of the driver: `freenect` for a Kinect, `uvc` for a colour camera on USB."""
+    path: str = "/dev/video0"
+    """File of a `uvc` device; a name in /dev/v4l/by-id stays the same when cameras are plugged in another order."""
+    width: Annotated[int, Meta(ge=64, le=4096)] = 640
+    height: Annotated[int, Meta(ge=48, le=4096)] = 480
+    rate_hz: Annotated[float, Meta(gt=0, le=240)] = 30.0
+    """Size and rate of the pictures that a `uvc` device is asked for."""
     library: str = ""
     """Path of a libfreenect; by default the system's."""
     recording: str = ""
@@ -33,18 +39,18 @@ class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RawFrame(NamedTuple):
-    """A colour image and a depth image of the same moment, as the device delivers them."""
+    """A colour image and, from a device that measures it, a depth image of the same moment, as they are delivered."""
 
     stamp_ns: int
     """Middle of the exposure, robot's clock."""
     colour: ImageArray
     """RGB, (height, width, 3)."""
-    depth: CodeArray
-    """Raw 11-bit codes from the depth camera's viewpoint, (height, width); 2047 is no data."""
+    depth: CodeArray | None
+    """Codes from the depth camera's viewpoint, (height, width), as the robot's description says; None without depth."""
 
 
 class DepthCamera(Protocol):
-    """A device that is open. When its cable is pulled, `frames` waits until it is back."""
+    """A device that is open, with depth or without. When its cable is pulled, `frames` waits until it is back."""
 
     def frames(self) -> AsyncIterator[RawFrame]:
         """Yield each frame as it comes; a frame that nobody takes in time is replaced by the next."""

@@ -51,7 +51,7 @@ class Straightener:
     """Rectifies the frames of one robot's Kinect. Without measured lenses it changes nothing."""
 
     def __init__(self, robot: Robot) -> None:
-        kinect = robot.kinect
+        kinect = robot.eye
         target = robot.camera
         shape = target.height, target.width
         v, u = np.mgrid[0 : target.height, 0 : target.width].astype(float)
@@ -66,7 +66,7 @@ class Straightener:
             turned = rays @ turn  # the inverse rotation: into the depth camera's frame
             self._depth = _maps(Lens(kinect.depth_lens).pixels(turned), shape, nearest=True)
             # A point's depth differs along the turned axis by the factor `gain`. Codes are almost linear in 1 / z.
-            _, b, c = kinect.depth_curve
+            _, b, c = kinect.curve
             endless = b * (pi / 2 - c)
             gain = turned[:, 2].reshape(shape).astype(np.float32)
             if float(np.abs(gain - 1.0).max()) * endless > MATTERS_CODES:
@@ -83,7 +83,7 @@ class Straightener:
         colour, depth = frame.colour, frame.depth
         if self._colour is not None:
             colour = np.asarray(cv2.remap(colour, self._colour[0], self._colour[1], cv2.INTER_LINEAR), np.uint8)
-        if self._depth is not None:
+        if depth is not None and self._depth is not None:
             u, v = self._depth
             carried = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=NO_DATA)
             depth = np.asarray(carried, np.uint16)

@@ -1,4 +1,4 @@
-"""The Kinect service: publishes the driver's frames, straightened."""
+"""The camera's service: publishes the frames of the Kinect or of another camera, straightened."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ async def run(node: Node, config: KinectConfig) -> None:
     reporter = FaultReporter(node)
 
     def on_fault(fault: str) -> None:
-        works = f"plays {config.recording}" if config.recording else config.device
+        device = f"{config.device} {config.path}" if config.device == "uvc" else config.device
+        works = f"plays {config.recording}" if config.recording else device
         reporter.report((fault,) if fault else (), degraded="no pictures" if fault else "", ready=works)
 
     with closing(open_device(config, node.clock, on_fault)) as camera:
@@ -38,11 +39,13 @@ implementation = Implementation(KinectConfig, run)
 
 def to_message(frame: RawFrame) -> Frame:
     """The message of a frame. Pixels are copied only when they are not contiguous."""
-    height, width = frame.depth.shape
+    height, width = frame.colour.shape[:2]
     return Frame(
         stamp_ns=frame.stamp_ns,
         width=width,
         height=height,
         colour=np.ascontiguousarray(frame.colour).reshape(-1).data,
-        depth=np.ascontiguousarray(frame.depth, dtype="<u2").reshape(-1).view(np.uint8).data,
+        depth=memoryview(b"")
+        if frame.depth is None
+        else np.ascontiguousarray(frame.depth, dtype="<u2").reshape(-1).view(np.uint8).data,
     )

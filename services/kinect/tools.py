@@ -46,7 +46,9 @@ class ViewCollector:
         self._places: list[FloatArray] = []
 
     def take(self, frame: RawFrame) -> str:
-        """Take a frame; returns a line for the operator, or ''."""
+        """Take a frame; returns a line for the operator, or ''. Raises CocoroError for one without depth."""
+        if frame.depth is None:
+            raise CocoroError("this camera measures no depth: the calibration is that of a Kinect")
         rough = find_corners(frame.colour, self._board, quick=True)
         before, self._before = self._before, rough
         if rough is None:
@@ -68,7 +70,7 @@ class ViewCollector:
         corners = find_corners(frames[-1].colour, self._board)
         if corners is None:
             return "the board is not seen whole"
-        view = BoardView(corners, median_depth([frame.depth for frame in frames]))
+        view = BoardView(corners, median_depth([frame.depth for frame in frames if frame.depth is not None]))
         self.views.append(view)
         self._places.append(place)
         if self._folder is not None:

@@ -18,6 +18,8 @@ from cocoro.objects import Catalogue
 from cocoro.robot import Camera, Robot
 from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, OBSTACLES, Topic
 from services.perception.blob import BlobDetector
+from services.perception.colour_alone import ColourLocaliser
+from services.perception.colour_floor import ColourFloorScanner
 from services.perception.config import PerceptionConfig
 from services.perception.floor import FloorScanner
 from services.perception.image import Detector, ImageSighting, RgbdImage
@@ -41,7 +43,7 @@ class _Pending:
     camera: Camera
     sightings: tuple[ImageSighting, ...]
     floor_depth_m: Float32Array | None
-    """Depth on a coarse grid, m, shape (rows, columns); None when no floor scan is due."""
+    """What the floor's scanner has taken from the picture, shape (rows, columns); None when no floor scan is due."""
     nearest: bytes
     """As in `Obstacles`, of the same image."""
     deadline_ns: int
@@ -58,11 +60,12 @@ class PerceptionCore:
         self._robot = robot
         self._config = config
         self._detector: Detector = DETECTORS[config.detector](catalogue, config)
-        self._localiser = Localiser(robot, catalogue, config.occluded_share)
+        localiser, scanner = (Localiser, FloorScanner) if robot.sees_depth else (ColourLocaliser, ColourFloorScanner)
+        self._localiser = localiser(robot, catalogue, config.occluded_share)
         self._head = History(len(self._localiser.joints))
         self._max_gap_ns = round(config.max_head_gap_s * NS)
         self._pending: deque[_Pending] = deque()
-        self._floor = FloorScanner(robot, config)
+        self._floor = scanner(robot, config)
         self._floor_period: int | None = None
         self._now_ns = 0
         self.stale_frames = 0
@@ -93,6 +96,7 @@ class PerceptionCore:
         return self._release(now_ns)
 
     def _remember(self, state: ServoState) -> None:
+        self._floor.watch(state)
         angles = dict(zip(state.joints, state.position_rad, strict=True))
         if self._localiser.joints and all(joint in angles for joint in self._localiser.joints):
             head = [angles[joint] for joint in self._localiser.joints]

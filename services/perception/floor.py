@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from cocoro.messages import Obstacles
+from cocoro.messages import Obstacles, ServoState
 from cocoro.robot import Robot
 from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
@@ -40,10 +40,10 @@ class FloorScanner:
     def __init__(self, robot: Robot, config: PerceptionConfig) -> None:
         self._robot = robot
         self._config = config
-        self._offset_m = np.array(robot.kinect.depth_offset_m)
+        self._offset_m = np.array(robot.eye.depth_offset_m)
         self._directions: dict[tuple[int, int], FloatArray] = {}
 
-    def sample(self, image: RgbdImage) -> Float32Array:
+    def sample(self, image: RgbdImage) -> Float32Array | None:
         """Depth on a coarse grid of 80 x 60 pixels at any resolution, m, shape (rows, columns); NaN without data."""
         step = max(image.width // 80, 1)
         return self._robot.depth_m(image.raw_depth[step // 2 :: step, step // 2 :: step])
@@ -83,19 +83,10 @@ class FloorScanner:
         tolerance = config.floor_tolerance_m + config.floor_tolerance_per_m * distance
         floor = np.abs(points[:, 2]) <= tolerance
         standing = (points[:, 2] > tolerance) & (points[:, 2] < config.obstacle_height_m)
-        cells, heights, lowest = _cells(points[standing])
-        bearing = np.arctan2(level[:, 1], level[:, 0])
-        ray = np.floor(np.degrees(bearing) / _RAY_DEG).astype(np.int64) % _RAYS
-        return Obstacles(
-            points_m=tuple(
-                (round(x, 3), round(y, 3), round(z, 3))
-                for (x, y), z in zip(cells.tolist(), heights.tolist(), strict=True)
-            ),
-            lowest_m=tuple(round(z, 3) for z in lowest.tolist()),
-            free=_free(ray, distance, floor, standing),
-            shown=_shown(bearing, distance, floor),
-            origin_m=(float(origin[0]), float(origin[1])),
-        )
+        return told(points, level, floor, standing, origin)
+
+    def watch(self, state: ServoState) -> None:
+        """Take note of the arm's angles. What the arm hides or pretends, depth shows by itself."""
 
     def _rays(self, shape: tuple[int, ...], width: int, height: int) -> FloatArray:
         """Directions of the grid's pixels in the depth camera's frame, z = 1, shape (rows, columns, 3)."""
@@ -107,6 +98,24 @@ class FloorScanner:
             rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
             self._directions[(width, height)] = rays
         return rays
+
+
+def told(points: FloatArray, level: FloatArray, floor: BoolArray, standing: BoolArray, origin: FloatArray) -> Obstacles:
+    """The message of points (n, 3), body frame, m, that show the floor or what stands on it, each (n,); without a
+    stamp. `level` (n, 2) are the points as seen from `origin` (3,), the camera's place."""
+    distance = np.hypot(level[:, 0], level[:, 1])
+    cells, heights, lowest = _cells(points[standing])
+    bearing = np.arctan2(level[:, 1], level[:, 0])
+    ray = np.floor(np.degrees(bearing) / _RAY_DEG).astype(np.int64) % _RAYS
+    return Obstacles(
+        points_m=tuple(
+            (round(x, 3), round(y, 3), round(z, 3)) for (x, y), z in zip(cells.tolist(), heights.tolist(), strict=True)
+        ),
+        lowest_m=tuple(round(z, 3) for z in lowest.tolist()),
+        free=_free(ray, distance, floor, standing),
+        shown=_shown(bearing, distance, floor),
+        origin_m=(float(origin[0]), float(origin[1])),
+    )
 
 
 def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

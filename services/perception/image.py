@@ -12,7 +12,7 @@ import numpy as np
 from cocoro.arrays import CodeArray, Float32Array, ImageArray, IntArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
-from services.perception.registration import NO_DATA, PixelBox, Registration, registration
+from services.perception.registration import PixelBox, Registration, registration
 
 __all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
@@ -37,6 +37,8 @@ class RgbdImage:
     def of(cls, frame: Frame, robot: Robot) -> RgbdImage:
         shape = frame.height, frame.width
         colour = np.frombuffer(frame.colour, dtype=np.uint8).reshape(*shape, 3)
+        if not frame.has_depth:
+            return cls(colour, np.full(shape, robot.eye.no_depth_code, dtype=np.uint16), robot)
         return cls(colour, np.frombuffer(frame.depth, dtype="<u2").reshape(shape), robot)
 
     @cached_property
@@ -96,7 +98,7 @@ class RgbdImage:
             self._registered = self._registration.codes_in_boxes(self.raw_depth, boxes)
             self._registered_boxes = [(a, b, c, d) for a, b, c, d in boxes.tolist()]
         else:
-            self._registered = np.full(self.raw_depth.shape, NO_DATA, dtype=np.uint16)
+            self._registered = np.full(self.raw_depth.shape, self._robot.eye.no_depth_code, dtype=np.uint16)
             box = left, top, right, bottom
             self._registered[top:bottom, left:right] = self._registration.codes(self.raw_depth, box)
             self._registered_boxes = [box]

@@ -62,9 +62,9 @@ class Localiser:
         found = []
         for sighting in sightings:
             if sighting.depth_m is None:
-                found.append(_detection(sighting, None, "no depth"))
+                found.append(detection_of(sighting, None, "no depth"))
             elif angles_rad is None:
-                found.append(_detection(sighting, None, "no head angles"))
+                found.append(detection_of(sighting, None, "no head angles"))
             else:
                 detection = placed[sighting.label]
                 if detection is not None:
@@ -104,7 +104,7 @@ class Localiser:
         for sighting, (x, y, z), hidden, lost in rows:
             note = "cut" if sighting.cut else "occluded" if hidden else ""
             gone = lost or (bool(note) and self._underground(sighting.label, (x, y, z)))
-            found[sighting.label] = None if gone else _detection(sighting, (x, y, z), note)
+            found[sighting.label] = None if gone else detection_of(sighting, (x, y, z), note)
         return found
 
     def _underground(self, label: str, position_m: Vec3) -> bool:
@@ -115,7 +115,9 @@ class Localiser:
         return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
 
-def _detection(sighting: ImageSighting, position_m: Vec3 | None, note: str) -> Detection:
+def detection_of(
+    sighting: ImageSighting, position_m: Vec3 | None, note: str, sigma_m: float | None = None
+) -> Detection:
     return Detection(
         label=sighting.label,
         u_px=sighting.u_px,
@@ -125,6 +127,7 @@ def _detection(sighting: ImageSighting, position_m: Vec3 | None, note: str) -> D
         depth_m=sighting.depth_m,
         position_m=position_m,
         note=note,
+        sigma_m=sigma_m,
     )
 
 

@@ -20,16 +20,14 @@ from services.perception.runs import spread_out
 PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom, px; right and bottom are exclusive."""
 _ROWS = 48
-NO_DATA = 2047
-"""The depth code that stands for no data."""
 CODES = 65536
-"""Number of codes of two bytes. Those above `NO_DATA` stand for no data, too."""
+"""Number of codes of two bytes."""
 
 
 @lru_cache(maxsize=8)
 def registration(robot: Robot, width: int, height: int) -> Registration:
     """The registration of a robot's frames of `width` x `height` pixels."""
-    return Registration(robot, width, height, robot.kinect.depth_offset_m)
+    return Registration(robot, width, height, robot.eye.depth_offset_m)
 
 
 class Registration:
@@ -40,7 +38,8 @@ class Registration:
         camera's frame."""
         self._camera: Camera = robot.camera.scaled(width, height)
         self._offset_m = offset_m
-        self._nearest_m = robot.kinect.min_range_m
+        self._nearest_m = max(robot.eye.min_range_m, 0.1)
+        self._none = robot.eye.no_depth_code
         self._depth: Float32Array = robot.depth_m(np.arange(CODES, dtype=np.uint16))
         self.table: Float32Array = self._depth + np.float32(self._offset_m[2])
         """Depth in the colour camera's frame of each code, m, shape (65536,); NaN without data."""
@@ -61,7 +60,7 @@ class Registration:
 
     def codes(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
         """The depth codes at the colour pixels of a box, shape (bottom - top, right - left): of the point that the
-        colour pixel shows; `NO_DATA` or more without data, in an infrared shadow, and in cracks between moved
+        colour pixel shows; that of no data or more without data, in an infrared shadow, and in cracks between moved
         pixels. `raw_depth` is the depth camera's image, shape (height, width)."""
         return self._moved_sideways(raw_depth, box) if self._sideways else self.codes_generally(raw_depth, box)
 
@@ -78,7 +77,7 @@ class Registration:
         first, last = max(first, 0), min(last, self._camera.width)
         columns = np.arange(most, most + last - first)
         width = last - first + 2 * most
-        out = np.full((bottom - top, width), NO_DATA, dtype=np.uint16)
+        out = np.full((bottom - top, width), self._none, dtype=np.uint16)
         step = 1 if to_left else -1
         # Some rows at a time, which stay in the processor's cache.
         start = columns[::step] + np.arange(0, min(_ROWS, bottom - top) * width, width)[:, None]
@@ -90,10 +89,10 @@ class Registration:
         return out[:, most + left - first : most + right - first]
 
     def codes_in_boxes(self, raw_depth: CodeArray, boxes: IntArray) -> CodeArray:
-        """`codes` for boxes (n, 4), in the shape of the image; `NO_DATA` or another code beside them. For some small
+        """`codes` for boxes (n, 4), in the shape of the image; beside them any codes. For some small
         boxes of a large image; all pixels cost less in one box."""
         if not self._sideways:
-            out = np.full(raw_depth.shape, NO_DATA, dtype=np.uint16)
+            out = np.full(raw_depth.shape, self._none, dtype=np.uint16)
             for left, top, right, bottom in boxes.tolist():
                 box = left, top, right, bottom
                 out[top:bottom, left:right] = self.codes_generally(raw_depth, box)
@@ -114,7 +113,7 @@ class Registration:
         place = np.asarray(cv2.LUT(codes, self._shift_table)).reshape(-1).view(np.int64)
         place += pixels
         place += beyond
-        wide = np.full((height, width + most), NO_DATA, dtype=np.uint16)
+        wide = np.full((height, width + most), self._none, dtype=np.uint16)
         wide.reshape(-1)[place] = codes
         return np.ascontiguousarray(wide[:, most:] if to_left else wide[:, :width])
 
@@ -131,7 +130,7 @@ class Registration:
         raw = raw_depth[
             source_top : bottom + ceil(max(-shift_v, 0)) + spare, source_left : right + ceil(max(-shift_u, 0)) + spare
         ]
-        codes = np.minimum(raw, NO_DATA)
+        codes = np.minimum(raw, self._none)
         z = self._depth.take(codes)
         rows, columns = np.nonzero(np.isfinite(z))
         z, codes = z[rows, columns], codes[rows, columns]
@@ -142,6 +141,6 @@ class Registration:
         row = np.rint(v + np.float32(camera.cy - top)).astype(np.int64)
         width, height = right - left, bottom - top
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        out = np.full(width * height, NO_DATA, dtype=np.uint16)
+        out = np.full(width * height, self._none, dtype=np.uint16)
         np.minimum.at(out, row[inside] * width + column[inside], codes[inside])
         return out.reshape(height, width)

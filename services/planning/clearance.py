@@ -39,7 +39,7 @@ class Clearance:
         radii = [tube.radius_m for tube in hull.tube for _ in range(tube.balls)]
         self._radii = np.array(radii + [hull.finger_radius_m] * (len(_ALONG_FINGER) * len(self._fingers)))
         self._tree = robot.tree(*(name for tube in hull.tube for name in (tube.start, tube.end)), *self._fingers)
-        self._mount = None if robot.kinect.mount is None else np.array(robot.kinect.mount)
+        self._mount = None if robot.eye.mount is None else np.array(robot.eye.mount)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
         self._chassis_top_m = robot.base.chassis_height_m + ON_CHASSIS_M
         on_hand = [robot.arm.roll in robot.chain(tube.start).joints for tube in hull.tube]

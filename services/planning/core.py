@@ -24,6 +24,7 @@ from services.planning.config import PlanningConfig, of_body
 from services.planning.floor_plan import FloorPlanner
 from services.planning.learned import Learned
 from services.planning.state_estimator import StateEstimator
+from services.planning.without_depth import of_sight
 
 NO_COMMAND = "no command"
 """`BaseState.stopped_by` while the planner's commands do not arrive."""
@@ -36,7 +37,7 @@ class PlanningCore:
     """Motion advances by at most this much time in one step."""
 
     def __init__(self, robot: Robot, config: PlanningConfig) -> None:
-        config = replace(config, arm=of_body(config.arm, robot.reach))
+        config = of_sight(replace(config, arm=of_body(config.arm, robot.reach)), robot)
         self._config = config
         self._estimator = StateEstimator(
             config, robot, Catalogue.load(Path(config.objects) if config.objects else None)

@@ -212,7 +212,7 @@ class BaseAsNeck:
         tilt, half = self._on_body[1], self._half_view[1]
         if half <= tilt:
             return inf, inf  # it looks above the floor
-        reach = self._robot.kinect.min_range_m
+        reach = self._robot.eye.min_range_m
         near_m = max(self._up_m / tan(min(half - tilt, pi / 2)), max(reach**2 - self._up_m**2, 0.0) ** 0.5)
         far_m = self._up_m / tan(-tilt - half) if -tilt - half > 0.0 else inf
         return self._ahead_m + near_m, self._ahead_m + far_m
@@ -265,5 +265,5 @@ class BaseAsNeck:
 
 def _half_view_rad(robot: Robot, config: HeadConfig) -> tuple[float, float]:
     """Half of the picture's width and height, without its edge."""
-    kinect, margin = robot.kinect, config.view_margin_rad
+    kinect, margin = robot.eye, config.view_margin_rad
     return kinect.horizontal_fov_rad / 2 - margin, kinect.vertical_fov_rad / 2 - margin

@@ -158,10 +158,10 @@ class CameraTilt:
 def behind_mount(robot: Robot, pan_rad: FloatArray, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
     """Mark the places on the floor, by bearing, rad, and distance, m, body frame, that the mount hides from a camera
     with its neck at a pan, rad, each (n,) (slabs, Kay and Kajiya 1986); returns shape (n,)."""
-    if robot.kinect.mount is None:
+    if robot.eye.mount is None:
         return np.zeros(len(bearing_rad), dtype=bool)
-    low_m, high_m = robot.kinect.mount
-    neck, camera = (robot.chain(link).position(robot.head_angles()) for link in (robot.camera_pivot, robot.kinect.link))
+    low_m, high_m = robot.eye.mount
+    neck, camera = (robot.chain(link).position(robot.head_angles()) for link in (robot.camera_pivot, robot.eye.link))
     ahead_m = camera[0] - neck[0]
     eye = np.stack(
         [neck[0] + ahead_m * np.cos(pan_rad), neck[1] + ahead_m * np.sin(pan_rad), np.full(len(pan_rad), camera[2])],

@@ -39,6 +39,8 @@ class Track:
     surprise: float = 1.0
     """Smoothed normalised innovation; above 1 the object moves more than expected."""
     outliers: list[FloatArray] = field(default_factory=list)
+    common_m: float = 0.0
+    """Standard deviation of what the newest sightings' errors have in common, which no mean of them makes smaller."""
     body: Pose2 = field(default_factory=Pose2)
     """Where the robot was at the newest sighting, odometry frame."""
 
@@ -72,17 +74,20 @@ class TargetMemory:
         *,
         doubtful: bool,
         body: Pose2 | None = None,
+        own_sigma_m: float | None = None,
     ) -> None:
         """Enter a sighting: the object's centre (3,), odometry frame, metres, at the frame's stamp, seen from the
-        body's pose; None: the body has not moved since the last."""
+        body's pose; None: the body has not moved since the last. `own_sigma_m`: its standard deviation, if perception
+        tells it; several such sightings are no surer than the surest of them."""
         self._estimates.clear()
         config = self._config
-        sigma_m = config.sigma_m + config.sigma_per_m * distance_m
+        sigma_m = own_sigma_m if own_sigma_m is not None else config.sigma_m + config.sigma_per_m * distance_m
         if doubtful:
             sigma_m *= config.doubtful_factor
         track = self._tracks.get(label)
         if track is None or (stamp_ns - track.stamp_ns) / NS > config.forget_s:
             self._tracks[label] = Track(position_m.copy(), stamp_ns, sigma_m, body=body or Pose2())
+            self._tracks[label].common_m = sigma_m if own_sigma_m is not None else 0.0
             return
         body = body or track.body
         dt_s = (stamp_ns - track.stamp_ns) / NS
@@ -98,6 +103,9 @@ class TargetMemory:
         track.outliers.clear()
         track.covariance[0, 0] += drift_m**2
         self._update(track, predicted, position_m, dt_s, sigma_m)
+        # Far sightings say little of a near one's error, which counts from then on; a doubtful one does not worsen it.
+        if own_sigma_m is not None:
+            track.common_m = min(track.common_m, sigma_m) if doubtful and track.common_m else sigma_m
         track.body = body
         track.stamp_ns = stamp_ns
         track.sightings += 1
@@ -160,7 +168,9 @@ class TargetMemory:
             track.outliers.clear()
         track.outliers.append(position_m.copy())
         if len(track.outliers) >= _AGREE:
-            self._tracks[label] = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m, body=body)
+            moved = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m, body=body)
+            moved.common_m = sigma_m if track.common_m else 0.0
+            self._tracks[label] = moved
 
     def estimate(self, label: str, body: Pose2, now_ns: int) -> TargetEstimate | None:
         """The estimate of an object now, in the frame of the body's pose; None for an unknown one."""
@@ -188,7 +198,9 @@ class TargetMemory:
             label=label,
             position_m=body.inverse().apply(position.tolist()),
             velocity_mps=(float(track.velocity_mps[0]), float(track.velocity_mps[1]), float(track.velocity_mps[2])),
-            sigma_m=float(hypot(track.sigma_m, 0.01 * age_s, self._drift_m(track, body, position))),
+            sigma_m=float(
+                hypot(max(track.sigma_m, track.common_m), 0.01 * age_s, self._drift_m(track, body, position))
+            ),
             age_s=age_s,
             odometry_position_m=(float(position[0]), float(position[1]), float(position[2])),
         )

@@ -40,7 +40,7 @@ class Postures:
         marker = robot.the_marker
         self._marker = robot.chain(marker.link), np.array([*marker.position_m, 1.0])
         self._gaze = gaze
-        self._nearest_m = robot.kinect.min_range_m
+        self._nearest_m = robot.eye.min_range_m
 
     def marker_m(self, angles: Mapping[str, float]) -> tuple[float, float, float]:
         """The marker's nominal position (x, y, z), body frame, metres, for the angles of all joints."""

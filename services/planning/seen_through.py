@@ -45,7 +45,7 @@ class DepthView:
         self._camera = robot.camera.scaled(COLUMNS, ROWS)
         pose = robot.camera_chain.pose(angles_rad)
         self._turn = pose[:3, :3]
-        self._origin = pose[:3, 3] + self._turn @ np.array(robot.kinect.depth_offset_m)
+        self._origin = pose[:3, 3] + self._turn @ np.array(robot.eye.depth_offset_m)
         depth = np.frombuffer(nearest, dtype=np.uint8).reshape(ROWS, COLUMNS) * STEP_M
         self._depth = np.where(depth > 0.0, depth, np.nan)
 

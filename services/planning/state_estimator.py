@@ -262,7 +262,10 @@ class StateEstimator:
             doubtful = detection.note != ""
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
-            self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful, body=body)
+            self.memory.see(
+                detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful, body=body,
+                own_sigma_m=detection.sigma_m,
+            )  # fmt: skip
             item = self._known.get(detection.label)
             if item is not None and self.memory.sure(detection.label):
                 x, y, z = place.tolist()

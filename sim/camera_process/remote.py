@@ -48,7 +48,7 @@ class RemoteKinect:
         slots: int,
     ) -> None:
         setup = Setup(robot.to_data(), list(visuals), sensors, seed, width, height, renderer, slots)
-        self._width, self._height = width, height
+        self._width, self._height, self._sees_depth = width, height, robot.sees_depth
         self._free = deque(range(slots))
         self._due: deque[int] = deque()
         """Slots that were exposed, in order; the first ones may have been answered."""
@@ -98,8 +98,9 @@ class RemoteKinect:
         self._free.append(number)
         slot = self._slots[number]
         return Frame(
-            stamp_ns=stamp_ns, width=self._width, height=self._height, colour=slot.colour.data, depth=slot.depth.data
-        )
+            stamp_ns=stamp_ns, width=self._width, height=self._height, colour=slot.colour.data,
+            depth=slot.depth.data if self._sees_depth else memoryview(b""),
+        )  # fmt: skip
 
     def _receive(self) -> None:
         try:

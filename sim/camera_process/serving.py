@@ -69,7 +69,9 @@ def _serve(channel: socket.socket, setup: Setup, memory: mmap.mmap, kept: _Kept)
         slot = slots[asked.slot]
         light = _Light(asked.ambient, asked.diffuse, asked.direction, asked.temperature_k)
         frame = kinect.capture(slot.poses, slot.camera_pose, asked.stamp_ns, light)
-        slot.colour.data[:], slot.depth.data[:] = frame.colour, frame.depth
+        slot.colour.data[:] = frame.colour
+        if frame.has_depth:
+            slot.depth.data[:] = frame.depth
         channel.send(msgspec.msgpack.encode(Taken(asked.slot, kept.take())))
 
 

@@ -176,17 +176,17 @@ class FoxgloveScene:
                 ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
             )
             picture = fg.CompressedImage(
-                timestamp=at, frame_id=self._robot.kinect.link, data=jpeg.tobytes(), format="jpeg"
+                timestamp=at, frame_id=self._robot.eye.link, data=jpeg.tobytes(), format="jpeg"
             )
             yield Shown("/camera/colour", picture)
         camera = self._robot.camera.scaled(frame.width, frame.height)
         k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
         calibration = fg.CameraCalibration(
-            timestamp=at, frame_id=self._robot.kinect.link, width=frame.width, height=frame.height, K=k,
+            timestamp=at, frame_id=self._robot.eye.link, width=frame.width, height=frame.height, K=k,
             R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
         )  # fmt: skip
         yield Shown("/camera/calibration", calibration)
-        if self._depth and self._wanted("/camera/depth"):
+        if self._depth and frame.has_depth and self._wanted("/camera/depth"):
             yield Shown("/camera/depth", self._depth_image(at, frame))
         if 0 <= frame.stamp_ns - self._cloud_ns < geometry.POINTS_PERIOD_NS or not self._wanted("/camera/points"):
             return
@@ -202,7 +202,7 @@ class FoxgloveScene:
             for n, name in enumerate(("red", "green", "blue", "alpha"))
         ]
         cloud = fg.PointCloud(
-            timestamp=at, frame_id=self._robot.kinect.link, pose=_pose((0.0, 0.0, 0.0)), point_stride=16, fields=fields,
+            timestamp=at, frame_id=self._robot.eye.link, pose=_pose((0.0, 0.0, 0.0)), point_stride=16, fields=fields,
             data=packed.tobytes(),
         )  # fmt: skip
         yield Shown("/camera/points", cloud)
@@ -211,7 +211,7 @@ class FoxgloveScene:
         raw = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
         depth_mm = np.nan_to_num(1e3 * self._robot.depth_m(raw), nan=0.0).astype("<u2")
         return fg.RawImage(
-            timestamp=at, frame_id=self._robot.kinect.link, width=frame.width, height=frame.height, encoding="16UC1",
+            timestamp=at, frame_id=self._robot.eye.link, width=frame.width, height=frame.height, encoding="16UC1",
             step=2 * frame.width, data=depth_mm.tobytes(),
         )  # fmt: skip
 

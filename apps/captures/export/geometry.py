@@ -94,7 +94,9 @@ class Posture:
 
 def points(frame: Frame, robot: Robot, step: int) -> tuple[Float32Array, ImageArray]:
     """Points of the depth image, shape (n, 3), m, in the colour camera's frame (x right, y down, z forward), and their
-    RGB colours, shape (n, 3). Every `step`th row and column is used."""
+    RGB colours, shape (n, 3); none without depth. Every `step`th row and column is used."""
+    if not frame.has_depth:
+        return np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8)
     camera = robot.camera.scaled(frame.width, frame.height)
     raw = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)[::step, ::step]
     depth = robot.depth_m(raw)
@@ -102,7 +104,7 @@ def points(frame: Frame, robot: Robot, step: int) -> tuple[Float32Array, ImageAr
     z = depth[rows, columns]
     x = (columns * step - np.float32(camera.cx)) * z / np.float32(camera.fx)
     y = (rows * step - np.float32(camera.cy)) * z / np.float32(camera.fy)
-    places = np.stack((x, y, z), axis=1).astype(np.float32) + np.array(robot.kinect.depth_offset_m, dtype=np.float32)
+    places = np.stack((x, y, z), axis=1).astype(np.float32) + np.array(robot.eye.depth_offset_m, dtype=np.float32)
     u = np.rint(places[:, 0] * camera.fx / places[:, 2] + camera.cx).astype(np.int32)
     v = np.rint(places[:, 1] * camera.fy / places[:, 2] + camera.cy).astype(np.int32)
     seen = (u >= 0) & (u < frame.width) & (v >= 0) & (v < frame.height)

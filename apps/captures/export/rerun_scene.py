@@ -165,7 +165,7 @@ class RerunScene:
         places, colours = geometry.points(frame, self._robot, DEPTH_STEP)
         links = self._posture.links()
         if links:  # below the body, because entities below a camera are drawn into its picture
-            pose = links[self._robot.kinect.link]
+            pose = links[self._robot.eye.link]
             self._log(
                 "world/body/points", rr.Points3D(places @ pose[:3, :3].T + pose[:3, 3], colors=colours, radii=0.004)
             )
@@ -209,7 +209,7 @@ class RerunScene:
             return
         rr = self._rr
         self._log("world/body/links", rr.LineStrips3D(self._posture.bones(links), radii=0.01, colors=[BONE]))
-        pose = links[self._robot.kinect.link]
+        pose = links[self._robot.eye.link]
         turn = rr.Quaternion(xyzw=geometry.quaternion(pose[:3, :3]))
         self._log("world/body/camera", rr.Transform3D(translation=pose[:3, 3], rotation=turn))
 
