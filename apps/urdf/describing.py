@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from apps.urdf.assumed import LIMITS_DEG, LINE, SPEED_RADPS, TORQUE_NM, body_of, camera_of, claw_of, lines
+from apps.urdf.assumed import LIMITS_DEG, LINE, SPEED_RADPS, body_of, camera_of, claw_of, lines, torque_nm
 from apps.urdf.hand import hand_of
 from apps.urdf.missing import Missing, missing_of
 from apps.urdf.model import Urdf
 from apps.urdf.parts import Parts, carriers
+from apps.urdf.posture import postures_of
 from apps.urdf.reading import read
 from apps.urdf.roles import Roles, roles_of
 from apps.urdf.rows import Rows, rounded
+from apps.urdf.things import can_m
 from apps.urdf.values import UrdfError
 from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
@@ -74,6 +76,9 @@ def _described(urdf: Urdf, name: str) -> Made:
     data["solid"] = _solid(urdf, roles, rows, parts)
     try:
         robot = Robot.from_data({"head": None} | data, "the description made of it")
+        if (postures := postures_of(robot, 2.0 * can_m(robot)[0])) is not None:
+            data |= {"reach": postures.reach, "pose": postures.poses}
+            robot = Robot.from_data({"head": None} | data, "the description made of it")
     except ConfigError as error:
         raise UrdfError(str(error)) from error
     return Made(data, missing_of(urdf, roles, hand, parts, body, data), robot)
@@ -87,7 +92,7 @@ def _joint(urdf: Urdf, name: str, roles: Roles) -> dict[str, Any]:
         "network": LINE,
         "id": roles.joints.index(name) + 1,
         "limits_deg": [rounded(low, 4), rounded(high, 4)],
-        "torque_nm": rounded(joint.effort_nm or TORQUE_NM),
+        "torque_nm": rounded(torque_nm(joint.effort_nm)),
         "max_speed_radps": rounded(joint.velocity_radps or SPEED_RADPS),
     }
 
