@@ -15,7 +15,7 @@ from apps.urdf.hand import hand_of
 from apps.urdf.missing import Missing, missing_of
 from apps.urdf.model import Urdf
 from apps.urdf.parts import Parts, carriers
-from apps.urdf.posture import postures_of
+from apps.urdf.posture import postures_of, straight_deg
 from apps.urdf.reading import read
 from apps.urdf.roles import Roles, roles_of
 from apps.urdf.rows import Rows, rounded
@@ -76,6 +76,9 @@ def _described(urdf: Urdf, name: str) -> Made:
     data["solid"] = _solid(urdf, roles, rows, parts)
     try:
         robot = Robot.from_data({"head": None} | data, "the description made of it")
+        if straight_deg(robot) is not None:
+            data["arm"]["straight_deg"] = straight_deg(robot)
+            robot = Robot.from_data({"head": None} | data, "the description made of it")
         if (postures := postures_of(robot, 2.0 * can_m(robot)[0])) is not None:
             data |= {"reach": postures.reach, "pose": postures.poses}
             robot = Robot.from_data({"head": None} | data, "the description made of it")

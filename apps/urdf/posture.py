@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import inf, pi
+from math import atan2, degrees, hypot, pi
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from apps.urdf.rows import rounded
-from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig
@@ -27,11 +26,10 @@ ASIDE_RAD = 1.45
 DRAWN, TRIED = 1500, 2
 """Postures that are drawn at random, and those of each way of bending that are tried."""
 _COARSE_M, _STEP_M = 0.04, 0.01
+_LEAST_M2 = 1e-6
 _NEAREST_M, _FARTHEST_M = 0.10, 1.0
 _BETWEEN_M = 0.03
 """Along the arm, between the surfaces of balls that must not overlap where it folds."""
-_SWEEP = 12
-"""Postures between unfolded and folded that must be clear, too."""
 
 
 class Postures(NamedTuple):
@@ -39,6 +37,28 @@ class Postures(NamedTuple):
 
     poses: dict[str, dict[str, float]]
     reach: dict[str, Any]
+
+
+def straight_deg(robot: Robot) -> float | None:
+    """Angle of the bend at which the joint before it and the one behind it are the farthest apart; None where they are
+    always the same distance apart."""
+    arm = robot.arm
+    number = arm.joints.index(arm.bend)
+    if number == 0:
+        return None
+    before = robot.link_of(arm.joints[number - 1])
+    behind = robot.link_of((*arm.joints, arm.roll)[number + 1])
+    tree, still = robot.tree(before, behind), dict.fromkeys(robot.joints, 0.0)
+
+    def square_m2(angle_rad: float) -> float:
+        poses = tree.poses(still | {arm.bend: angle_rad})
+        return float(np.sum((poses[behind] - poses[before])[:3, 3] ** 2))
+
+    ahead, aside, back = (square_m2(angle) for angle in (0.0, pi / 2, pi))
+    even = (ahead + back) / 2
+    if hypot(ahead - even, aside - even) < _LEAST_M2:
+        return None
+    return rounded(degrees(atan2(aside - even, ahead - even)), 3)
 
 
 class _Arm:
@@ -69,24 +89,21 @@ class _Arm:
         far = np.abs(along[:, None] - along[None]) > radii[:, None] + radii[None] + _BETWEEN_M
         return bool((far & (apart < 0.0) & ~(hand[:, None] & hand[None])).any())
 
-    def extent_m(self, arm: Mapping[str, float]) -> float:
-        """Greatest distance of the hull from the body's middle."""
-        centres, radii = self._clearance.hull(self.angles(arm))
-        return float((np.hypot(centres[:, 0], centres[:, 1]) + radii).max())
-
     def found(self, start: Mapping[str, float], radius_m: float, height_m: float) -> dict[str, float] | None:
         """The arm's angles with the hand ahead at that place, clear of everything; None where there are none."""
         pose = HandPose(radius_m, 0.0, height_m, self.config.pitch_rad)
         arm = self.reacher.solve(self.angles(start), pose)
-        return arm if arm is not None and self.clear(arm) else None
+        bend, straight_rad = self.robot.arm.bend, self.robot.arm.straight_rad
+        if arm is None or (arm[bend] - straight_rad) * (start[bend] - straight_rad) < 0.0:
+            return None
+        return arm if self.clear(arm) else None
 
 
 def postures_of(robot: Robot, wide_m: float) -> Postures | None:
     """Postures and distances for things of that width on the floor; None for an arm that reaches none there with a
     level hand."""
     arm = _Arm(robot)
-    drawn = _drawn(arm)
-    ways = [_way(arm, start) for start in _starts(arm, drawn)]
+    ways = [_way(arm, start) for start in _starts(arm, _drawn(arm))]
     best = max((way for way in ways if way is not None), key=lambda way: way.room_m, default=None)
     if best is None:
         return None
@@ -105,7 +122,7 @@ def postures_of(robot: Robot, wide_m: float) -> Postures | None:
         "carry_radius_m": best.travel_m,
         "carry_rise_m": best.rise_m,
     }
-    poses = {"park": _folded(arm, drawn, upright), "unfolded": unfolded, "upright": upright}
+    poses = {"park": _folded(arm, best), "unfolded": unfolded, "upright": upright}
     return Postures(
         {name: {joint: rounded(angle, 4) for joint, angle in pose.items()} for name, pose in poses.items()},
         {name: [rounded(v, 3) for v in value] if isinstance(value, list) else rounded(value, 3)
@@ -140,12 +157,12 @@ def _drawn(arm: _Arm) -> list[dict[str, float]]:
 
 def _starts(arm: _Arm, drawn: list[dict[str, float]]) -> list[dict[str, float]]:
     """Of each way of bending the postures whose hand is the most nearly level, ahead and a little above the floor."""
-    bend = arm.robot.arm.bend
+    bend, straight_rad = arm.robot.arm.bend, arm.robot.arm.straight_rad
     scored: dict[bool, list[tuple[float, int]]] = {False: [], True: []}
     for number, posture in enumerate(drawn):
         pose = arm.reacher.pose(arm.angles(posture))
         off = abs(pose.pitch_rad - arm.config.pitch_rad) + 2.0 * abs(pose.height_m - TRAVEL_M) + abs(pose.azimuth_rad)
-        scored[posture[bend] > 0.0].append((off, number))
+        scored[posture[bend] > straight_rad].append((off, number))
     return [drawn[number] for rows in scored.values() for _, number in sorted(rows)[:TRIED]]
 
 
@@ -187,26 +204,14 @@ def _run(arm: _Arm, start: dict[str, float], radius_m: float, step_m: float) -> 
     return found
 
 
-def _folded(arm: _Arm, drawn: list[dict[str, float]], upright: Mapping[str, float]) -> dict[str, float]:
-    """Turned to a side, and of what it comes to from there without touching anything the posture that is the
-    closest to the body's middle."""
+def _folded(arm: _Arm, way: _Way) -> dict[str, float]:
+    """The hand drawn in as far as the arm does it level, and turned to a side. Low, so that no camera looks at it."""
     azimuth = arm.reacher.azimuth
     low, high = arm.robot.joints[azimuth].limits_rad
     aside = {azimuth: ASIDE_RAD if high >= ASIDE_RAD else max(low, -ASIDE_RAD) if -low > high else high}
-    best, least_m = dict(upright) | aside, inf
-    if arm.clear(best):
-        least_m = arm.extent_m(best)
-    for posture in drawn:
-        folded = posture | aside
-        if arm.extent_m(folded) < least_m and _swept(arm, dict(upright) | aside, folded):
-            best, least_m = folded, arm.extent_m(folded)
-    return best
-
-
-def _swept(arm: _Arm, start: Mapping[str, float], end: Mapping[str, float]) -> bool:
-    """Whether the arm is clear all the way from one posture to another."""
-    shares: FloatArray = np.linspace(1.0, 0.0, _SWEEP)
-    return all(
-        arm.clear({name: (1 - share) * start[name] + share * angle for name, angle in end.items()})
-        for share in shares.tolist()
-    )
+    best, radius_m = way.upright, way.travel_m
+    while radius_m > _NEAREST_M and (nearer := arm.found(best, radius_m - _STEP_M, TRAVEL_M)) is not None:
+        if not arm.clear(nearer | aside):
+            break
+        best, radius_m = nearer, radius_m - _STEP_M
+    return best | aside

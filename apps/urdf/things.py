@@ -24,11 +24,18 @@ _TARGETS = (("red_can", 0.1, 0.17), ("green_can", -0.4, 0.17), ("blue_can", -0.4
 
 def can_m(robot: Robot) -> tuple[float, float]:
     """Radius and height of the cans for its hand: the project's, or smaller ones."""
-    wide_m = widest_m(robot, HandConfig())
+    wide_m = _opening_m(robot)
     if _SHARE * wide_m >= CAN_M:
         return CAN_M, HIGH_M
     radius_m = round(max(_SHARE * wide_m, _LEAST_M), 3)
     return radius_m, round(min(HIGH_M, max(5.0 * radius_m, 0.08)), 3)
+
+
+def _opening_m(robot: Robot) -> float:
+    """Width of what the open hand goes around, m. The gap of a pair of jaws is assumed, and fingers are thick: it does
+    not count."""
+    wide_m = widest_m(robot, HandConfig())
+    return wide_m if robot.claw.fixed_pad_m is not None else wide_m - robot.claw.pad_gap_m
 
 
 def objects_text(name: str, robot: Robot) -> str | None:
@@ -39,7 +46,7 @@ def objects_text(name: str, robot: Robot) -> str | None:
     rows = own_text()[own_text().index("[[object]]") :]
     rows = rows.replace(f"radius_m = {CAN_M}\nheight_m = {HIGH_M:.3f}", f"radius_m = {radius_m}\nheight_m = {height_m}")
     rows = rows.replace(f"radius_m = {BALL_M:.3f}", f"radius_m = {min(radius_m, BALL_M)}")
-    wide_mm = 1000.0 * widest_m(robot, HandConfig())
+    wide_mm = 1000.0 * _opening_m(robot)
     return f"# The known objects of {name}: the project's, in sizes for a hand that takes {wide_mm:.0f} mm.\n\n{rows}"
 
 
