@@ -14,7 +14,7 @@ from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig
 from services.planning.reach import HandPose, Reacher
 
-LOW_M, TRAVEL_M, RISE_M = 0.06, 0.20, (0.12, 0.08, 0.05)
+LOW_M, TRAVEL_M, RISE_M = 0.05, 0.20, (0.12, 0.08, 0.05)
 """Heights: of a thing on the floor, of the empty hand on its way, and by how much a thing is lifted, in this order."""
 BEHIND_M, APART_M = 0.005, 0.04
 """The hand waits so far beyond the least distance that it reaches; and there it leaves so much to the things that it
@@ -112,22 +112,24 @@ def postures_of(robot: Robot, wide_m: float) -> Postures | None:
     low, high = best.low_m, best.high_m
     retreat = low + BEHIND_M
     near = min(retreat + wide_m / 2 + APART_M, (retreat + high) / 2)
-    reach = {
+    distances_m = {
         "grasp_radius_m": (near + high) / 2,
-        "grasp_radius_range_m": [near, high],
-        "touch_radius_range_m": [(retreat + near) / 2, high + BEHIND_M],
         "retreat_radius_m": retreat,
         "travel_radius_m": best.travel_m,
         "travel_height_m": TRAVEL_M,
-        "carry_radius_m": best.travel_m,
+        "carry_radius_m": best.carry_m,
         "carry_rise_m": best.rise_m,
     }
+    ranges_m = {
+        "grasp_radius_range_m": (near, high),
+        "touch_radius_range_m": ((retreat + near) / 2, high + BEHIND_M),
+    }
+    reach: dict[str, Any] = {name: rounded(value, 3) for name, value in distances_m.items()}
+    reach |= {name: [rounded(value, 3) for value in pair] for name, pair in ranges_m.items()}
     poses = {"park": _folded(arm, best), "unfolded": unfolded, "upright": upright}
     return Postures(
-        {name: {joint: rounded(angle, 4) for joint, angle in pose.items()} for name, pose in poses.items()},
-        {name: [rounded(v, 3) for v in value] if isinstance(value, list) else rounded(value, 3)
-         for name, value in reach.items()},
-    )  # fmt: skip
+        {name: {joint: rounded(angle, 4) for joint, angle in pose.items()} for name, pose in poses.items()}, reach
+    )
 
 
 class _Way(NamedTuple):
@@ -135,6 +137,7 @@ class _Way(NamedTuple):
 
     upright: dict[str, float]
     travel_m: float
+    carry_m: float
     rise_m: float
     low_m: float
     high_m: float
@@ -172,14 +175,15 @@ def _way(arm: _Arm, start: Mapping[str, float]) -> _Way | None:
     if len(low) < 3:
         return None
     first, last = low[0][0], low[-1][0]
-    nearer = np.arange(first - _STEP_M, _NEAREST_M, -_STEP_M).tolist()
-    for travel_m in [*nearer, *(radius for radius, _ in low)]:
-        if (upright := arm.found(low[0][1], travel_m, TRAVEL_M)) is not None:
-            for rise_m in RISE_M:
-                if arm.found(low[len(low) // 2][1], travel_m, LOW_M + rise_m) is not None:
-                    return _Way(upright, travel_m, rise_m, first, last)
-            return None
-    return None
+    radii = [*np.arange(first - _STEP_M, _NEAREST_M, -_STEP_M).tolist(), *(radius for radius, _ in low)]
+    travels = ((radius, arm.found(low[0][1], radius, TRAVEL_M)) for radius in radii)
+    travel_m, upright = next(((radius, found) for radius, found in travels if found is not None), (0.0, None))
+    amid = low[len(low) // 2][1]
+    carries = ((rise, radius) for rise in RISE_M for radius in radii if arm.found(amid, radius, LOW_M + rise))
+    rise_m, carry_m = next(carries, (None, 0.0))
+    if upright is None or rise_m is None:
+        return None
+    return _Way(upright, travel_m, carry_m, rise_m, first, last)
 
 
 def _reached(arm: _Arm, start: Mapping[str, float]) -> list[tuple[float, dict[str, float]]]:

@@ -28,7 +28,7 @@ def can_m(robot: Robot) -> tuple[float, float]:
     if _SHARE * wide_m >= CAN_M:
         return CAN_M, HIGH_M
     radius_m = round(max(_SHARE * wide_m, _LEAST_M), 3)
-    return radius_m, round(min(HIGH_M, max(5.0 * radius_m, 0.08)), 3)
+    return radius_m, round(min(HIGH_M, max(5.0 * radius_m, 0.10)), 3)
 
 
 def _opening_m(robot: Robot) -> float:
