@@ -20,6 +20,7 @@ from apps.experiments.plan import ExperimentSettings
 from cocoro.errors import ConfigError, choice_of
 from cocoro.robot_files import RobotFiles
 from deploy.which_robot import files_of
+from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 EVERY = "all"
 
@@ -103,7 +104,10 @@ def run_experiments(
         body="worn" if body == "worn" else "nominal", samples=samples, jobs=jobs or os.cpu_count() or 1,
         description=None if files.description is None else str(files.description), measured=measured,
     )  # fmt: skip
-    settings.robot()  # refuses files that cannot be read before the first run
+    if lack := settings.robot().lacks(
+        (*BabbleArmTask.needs_body, *BabbleWheelsTask.needs_body)
+    ):  # files that cannot be read are refused, too
+        raise ConfigError(f"{lack}: every experiment begins with learning the body from the sight of its hand")
     if frames:
         settings = msgspec.structs.replace(settings, **frames_of(frames))
     progress = RunProgress(sys.stderr, settings.jobs)

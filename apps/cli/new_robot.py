@@ -16,7 +16,7 @@ def write_robot(name: str, urdf: Path, into: Path, as_json: bool = False) -> int
     URDF of which no description can be made, and for a file that cannot be written."""
     check_name(name)
     folder = free_folder(name, into)
-    made = describe(urdf, name)
+    made = describe(urdf, name, postures=True)
     source = "".join(letter if letter.isprintable() else "?" for letter in urdf.name)
     profile = folder / f"{name}-sim.toml"
     files = {

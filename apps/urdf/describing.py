@@ -41,17 +41,18 @@ class Made:
     robot: Robot
 
 
-def describe(path: Path, name: str) -> Made:
-    """Make the description of the robot `name` from the URDF in a file. Raises ConfigError as `reading.read` does, and
-    for a robot without an arm."""
+def describe(path: Path, name: str, *, postures: bool = False) -> Made:
+    """Make the description of the robot `name` from the URDF in a file; with `postures` chosen by the arm's kinematics,
+    which takes a second, and the table of its reach. Raises ConfigError as `reading.read` does, and for a robot without
+    an arm."""
     urdf = read(path)
     try:
-        return _described(urdf, name)
+        return _described(urdf, name, postures)
     except UrdfError as error:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def _described(urdf: Urdf, name: str) -> Made:
+def _described(urdf: Urdf, name: str, postures: bool) -> Made:
     roles = roles_of(urdf)
     hand = hand_of(urdf, roles)
     body = body_of(urdf, roles)
@@ -79,8 +80,8 @@ def _described(urdf: Urdf, name: str) -> Made:
         if straight_deg(robot) is not None:
             data["arm"]["straight_deg"] = straight_deg(robot)
             robot = Robot.from_data({"head": None} | data, "the description made of it")
-        if (postures := postures_of(robot, 2.0 * can_m(robot)[0])) is not None:
-            data |= {"reach": postures.reach, "pose": postures.poses}
+        if postures and (chosen := postures_of(robot, 2.0 * can_m(robot)[0])) is not None:
+            data |= {"reach": chosen.reach, "pose": chosen.poses}
             robot = Robot.from_data({"head": None} | data, "the description made of it")
     except ConfigError as error:
         raise UrdfError(str(error)) from error
