@@ -10,6 +10,7 @@ from spelled import asked
 from apps.cli.main import main
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from apps.urdf.describing import describe
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig
@@ -51,3 +52,29 @@ def test_it_touches_a_can_in_its_own_scene(ada: Path) -> None:
     result = rehearse(request)
     assert (result["outcome"], result["reason"]) == ("done", "")
     assert result["truth"]["collisions"] == ()
+
+
+@pytest.mark.parametrize("more", [1, 2])
+def test_an_arm_of_more_joints_reaches_as_well(tmp_path: Path, more: int) -> None:
+    text, axes = URDF.read_text(encoding="utf-8"), ("0 0 1", "0 1 0")
+    inertial = text[text.index("<inertial>") : text.index("</inertial>")] + "</inertial>"
+    above, joints = "wrist", ""
+    for number in range(more):
+        joints += (
+            f'<link name="knuckle{number}">{inertial}</link><joint name="more{number}" type="revolute">'
+            f'<parent link="{above}"/><child link="knuckle{number}"/><origin xyz="0.01 0 0"/>'
+            f'<axis xyz="{axes[number]}"/><limit lower="-1.5" upper="1.5" effort="3" velocity="4"/></joint>'
+        )
+        above = f"knuckle{number}"
+    file = tmp_path / "longer.urdf"
+    longer = text.replace('<parent link="wrist"/>', f'<parent link="{above}"/>').replace(
+        "</robot>", f"{joints}</robot>"
+    )
+    file.write_text(longer, encoding="utf-8")
+    made = describe(file, "ada", postures=True)
+    robot = made.robot
+    assert len(robot.arm.joints) == 4 + more
+    assert robot.reach is not None
+    reacher = Reacher(robot, ArmConfig().damping)
+    for radius_m in robot.reach.grasp_radius_range_m:
+        assert reacher.solve(reacher.upright, HandPose(radius_m, 0.3, 0.05, ArmConfig().pitch_rad)) is not None
