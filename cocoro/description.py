@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from importlib import resources
+from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,17 +39,23 @@ BASED_ON = "based_on"
 _MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
 
 
-class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Arm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the names of joints and links of the arm and the hand stand for."""
 
     joints: Annotated[tuple[str, ...], Meta(min_length=2)]
     """Those that bring the hand to a place, from the body out. The first one turns the arm about the vertical."""
     bend: str
     """The joint whose sign tells one way of reaching a place from the other. `pose.upright` has the sign to keep."""
+    straight_deg: float | UnsetType = UNSET
+    """Angle of `bend` at which the limbs on its two sides are in line: its sign counts from there. 0 by default."""
     roll: str
     """It turns the hand about the hand's own axis. The hand begins at the link that it moves."""
     tip: str
     """The link whose origin goes to a target's centre. Its z axis points along the hand."""
+
+    @property
+    def straight_rad(self) -> float:
+        return 0.0 if self.straight_deg is UNSET else radians(self.straight_deg)
 
     @property
     def azimuth(self) -> str:

@@ -25,17 +25,22 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.component import Component
-from cocoro.description import is_shipped
+from cocoro.description import SHIPPED, is_shipped
 from cocoro.errors import ConfigError, choice_of, field_text
+from cocoro.robot_files import RobotFiles, objects_beside, scene_beside
 from deploy.mesh_table import Mesh
 from deploy.processes import named, needs
 from deploy.site.component import PREFIX
+from sim.component import SIM
+from sim.scene_names import DEFAULT
 
 C = TypeVar("C")
-Name = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+_PATTERN = r"\A[a-z0-9][a-z0-9_-]{0,31}\Z"
+Name = Annotated[str, Meta(pattern=_PATTERN)]
 """A chunk of a key, and the name of a directory."""
 A_NAME = "a name has 1 to 32 small letters, digits, '-' and '_', and begins with a letter or a digit"
 
+SIMULATOR = SIM.name
 PACKAGE = "deploy"
 """The package whose resources contain the project's profiles."""
 
@@ -71,11 +76,33 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         description, measured = (None if file is None else Path(file) for file in (self.description, self.measured))
         return description, measured
 
-    def with_robot(self, description: Path | None, measured: Path | None) -> Profile:
-        """A profile like this one with another description or measured file; None keeps its own."""
-        files = {"description": description, "measured": measured}
-        given = {n: str(f if is_shipped(f) else f.resolve()) for n, f in files.items() if f is not None}
-        return msgspec.structs.replace(self, **given)
+    def of_robot(self, files: RobotFiles) -> Profile:
+        """A profile like this one for another robot. What was measured on this one goes, unless the other has the same
+        description. Raises ConfigError for a name that a mesh cannot have."""
+        if not re.fullmatch(_PATTERN, files.name):
+            raise ConfigError(f"robot description {files.description}: name = {files.name!r}: {A_NAME}")
+        description = None if files.description is None else _kept(files.description)
+        same = (description or SHIPPED[0]) == (self.description or SHIPPED[0])
+        return msgspec.structs.replace(
+            self,
+            robot=files.name,
+            description=description,
+            measured=str(files.measured) if files.measured is not None else self.measured if same else None,
+            objects=self.objects or (None if files.objects is None else str(files.objects)),
+        )
+
+    def with_own_files(self) -> Profile:
+        """A profile like this one with what lies beside the description where the profile names nothing else: the
+        robot's known objects, and its own scene of the name that the simulator's settings have."""
+        objects = self.objects or objects_beside(self.description)
+        made = msgspec.structs.replace(self, objects=None if objects is None else str(objects))
+        if not any(row.settings == SIMULATOR or row.name == SIMULATOR for row in self.rows()):
+            return made
+        table = self.service.get(SIMULATOR, {})
+        scene = scene_beside(self.description, str(table.get("scene", DEFAULT)))
+        if scene is None:
+            return made
+        return msgspec.structs.replace(made, service={**self.service, SIMULATOR: {**table, "scene": str(scene)}})
 
     def rows(self) -> tuple[Component, ...]:
         """The components. Raises ConfigError for an unknown one."""
@@ -124,8 +151,11 @@ def names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def read(which: str, overrides: Iterable[str] = ()) -> Profile:
-    """Read the profile with the name or path `which` and apply overrides such as `service.sim.seed=3`.
+def read(
+    which: str, overrides: Iterable[str] = (), robot: RobotFiles | None = None, measured: Path | None = None
+) -> Profile:
+    """Read the profile with the name or path `which` and apply overrides such as `service.sim.seed=3`. `robot` and
+    `measured` take the place of the robot and of the measured file that it names.
 
     Raises ConfigError that names file, table and field.
     """
@@ -140,12 +170,17 @@ def read(which: str, overrides: Iterable[str] = ()) -> Profile:
         _override(data, override)
     profile = from_data(data, which)
     home = source.parent if isinstance(source, Path) else None
-    return msgspec.structs.replace(
+    profile = msgspec.structs.replace(
         profile,
         description=_absolute(profile.description, home),
         measured=_absolute(profile.measured, home),
         objects=_absolute(profile.objects, home),
     )
+    if robot is not None:
+        profile = profile.of_robot(robot)
+    if measured is not None:
+        profile = msgspec.structs.replace(profile, measured=str(measured.resolve()))
+    return profile.with_own_files()
 
 
 def from_data(data: dict[str, Any], name: str) -> Profile:
@@ -204,6 +239,10 @@ def _override(data: dict[str, Any], override: str) -> None:
         if not isinstance(table, dict):
             raise ConfigError(f"{override!r}: {key} is a value, not a table")
     table[keys[-1]] = value
+
+
+def _kept(description: Path) -> str:
+    return str(description if is_shipped(description) else description.resolve())
 
 
 def _absolute(file: str | None, home: Path | None) -> str | None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from importlib import resources
 
+DEFAULT = "paper"
+"""The scene where none is named."""
 GENERATED = ("random", "rooms", "rooms-empty")
 """Names of the scenes that `sim.random_scene` makes."""
 

@@ -32,6 +32,7 @@ from sim.random_scene import find_scene
 from sim.realism import BodyRealism, body_of
 from sim.render import Lighting, make_renderer
 from sim.render.choice import RendererChoice
+from sim.scene_names import DEFAULT
 from sim.world import Motors, World, message_motors
 
 TICK_HZ = 120
@@ -48,7 +49,7 @@ makes the others' messages late."""
 
 
 class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    scene: str = "paper"
+    scene: str = DEFAULT
     target: str = ""
     """An object that a random scene must contain."""
     objects: str = ""

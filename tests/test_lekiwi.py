@@ -19,7 +19,7 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
-from deploy.profiles import from_data, read
+from deploy.profiles import read
 from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig, HandConfig, HeadConfig, PlanningConfig, of_body
 from services.planning.core import PlanningCore
@@ -143,8 +143,6 @@ def test_a_shipped_robot_is_asked_for_by_its_name(lekiwi: Robot, robot: Robot, t
     profile = tmp_path / "kiwi.toml"
     profile.write_text('robot = "kiwi"\ndescription = "lekiwi"\nprocesses = ["planning"]\n', encoding="utf-8")
     assert Robot.load(*read(str(profile)).robot_files).to_data() == lekiwi.to_data()
-    plain = from_data({"robot": "kiwi", "processes": ["planning"]}, "kiwi").with_robot(Path("lekiwi"), None)
-    assert plain.description == "lekiwi"
     with pytest.raises(ConfigError, match="lekiwi2"):
         Robot.load(Path("lekiwi2"))
 

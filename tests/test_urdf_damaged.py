@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from urdf_rig import DESK_ARM, desk_arm, rolling_arm, wheel
 
+from apps.urdf.assumed import TORQUE_NM
 from apps.urdf.describing import describe
 from apps.urdf.writing import description_text, page_text
 from cocoro.errors import ConfigError
@@ -80,3 +81,29 @@ def test_a_torque_below_nothing_and_a_number_beyond_all_are_refused(tmp_path: Pa
         describe(desk_arm(tmp_path, DESK_ARM.replace('effort="3"', 'effort="-3"')), "desk")
     with pytest.raises(ConfigError, match="link foot: value='1e21' of <mass> is not a number, or too large"):
         describe(desk_arm(tmp_path, DESK_ARM.replace('value="1.5"', 'value="1e21"')), "desk")
+
+
+def test_a_jaw_may_mimic_the_other_and_no_joint_of_the_arm_may(tmp_path: Path) -> None:
+    led = DESK_ARM.replace(
+        'effort="2" velocity="3"/>', 'effort="2" velocity="3"/><mimic joint="left" multiplier="-1"/>'
+    )
+    made = describe(desk_arm(tmp_path, led), "desk")
+    assert set(made.robot.jaws) == {"left", "right"}
+    assert any("right, which mimics left" in row.what for row in made.missing)
+    arm = DESK_ARM.replace(
+        '<joint name="bend" type="revolute">', '<joint name="bend" type="revolute"><mimic joint="lift"/>'
+    )
+    with pytest.raises(ConfigError, match="joint bend mimics lift"):
+        describe(desk_arm(tmp_path, arm), "desk")
+
+
+def test_a_pair_of_jaws_with_even_limits_opens_away_from_the_roll_axis(tmp_path: Path) -> None:
+    even = DESK_ARM.replace('lower="-1.5" upper="0.2"', 'lower="-1" upper="1"')
+    even = even.replace('lower="-0.2" upper="1.5"', 'lower="-1" upper="1"')
+    signs = describe(desk_arm(tmp_path, DESK_ARM), "desk").robot.claw.open_sign
+    assert describe(desk_arm(tmp_path, even), "desk").robot.claw.open_sign == signs
+
+
+def test_a_torque_that_was_not_filled_in_is_not_believed(tmp_path: Path) -> None:
+    made = describe(desk_arm(tmp_path, DESK_ARM.replace('effort="3"', 'effort="1000"')), "desk")
+    assert made.robot.joints["lift"].torque_nm == TORQUE_NM

@@ -72,7 +72,6 @@ def test_an_axis_that_is_not_given_is_x_as_the_format_says(tmp_path: Path) -> No
         (robot(LINKS + joint("p", "b", "c") + joint("q", "c", "b")), "has a loop of links at the joints p, q"),
         (robot('<link name="a"/>' + joint("p", "a", "a")), "has a loop of links at the joints p"),
         (robot(LINKS + joint("p", "a", "b", kind="prismatic")), "joint p is of type 'prismatic'"),
-        (robot(LINKS + PAIR.replace("</joint>", '<mimic joint="q"/></joint>', 1)), "joint p mimics another joint"),
         (robot(LINKS + '<joint name="p" type="fixed"><parent link="a"/></joint>'), "joint p: its <child> is missing"),
         (robot(LINKS + PAIR.replace("0 0 2", "0 0 0")), "joint p: its axis has no direction"),
         (robot(LINKS + PAIR.replace("0 0 2", "0 up 2")), "joint p: xyz='up' of <axis> is not a number"),

@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
+from apps.cli.former import taking_former
 from apps.cli.listed import COMMANDS
 
 
@@ -110,7 +111,7 @@ class CommandGroup(TyperGroup):
         name, command, rest = super().resolve_command(ctx, args)
         if name is not None and name in _NAMES:
             command = load(name)
-        return name, command if command is None else with_brackets(command), rest
+        return name, command if command is None else taking_former(with_brackets(command)), rest
 
     def _list_tasks(self, args: list[str]) -> None:
         """Makes typer suggest tasks, too, for a mistyped command; it looks into `commands` alone."""

@@ -67,7 +67,7 @@ def of_picture(path: Path, robot: Robot) -> CameraView:
 async def of_robot(choice: RobotChoice) -> CameraView:
     """The robot's newest view. Raises MeshError when the robot is not there, or publishes no frames or head angles."""
     async with joined(choice, frames=True, best=True) as link:
-        robot, catalogue = link.described(), link.catalogue_file()
+        robot, catalogue = await link.described(), link.catalogue_file()
         frame, head = await _frame(link, robot.camera_chain.joints)
     pose = robot.camera_chain.pose(head)
     raw_depth = None

@@ -68,6 +68,14 @@ def robots() -> Iterable[str]:
 
 
 @_names
+def described() -> Iterable[str]:
+    """Robots that are up here, and those whose descriptions the project ships."""
+    from cocoro.description import SHIPPED
+
+    return dict.fromkeys([*SHIPPED, *robots("")])
+
+
+@_names
 def processes() -> Iterable[str]:
     from deploy.processes import components
 
@@ -91,9 +99,10 @@ def topics() -> Iterable[str]:
 
 @_names
 def joints() -> Iterable[str]:
-    from cocoro.robot import Robot
+    """Joints of the robot that is up here, else of the Calliope."""
+    from deploy.which_robot import files_here
 
-    return Robot.load().joints
+    return files_here(None).load().joints
 
 
 @_names

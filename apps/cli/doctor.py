@@ -17,7 +17,7 @@ from pathlib import Path
 import typer
 
 from apps.cli import exits
-from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
+from apps.cli.options import AnyRobotOption, JsonOption, MeasuredOption, ProfileArgument
 from apps.cli.output import print_json
 from apps.cli.terminal import folded
 from cocoro.bus import shared
@@ -29,11 +29,12 @@ from cocoro.robot import Robot
 from cocoro.stop.asking import addresses
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
-from deploy import extras, profiles
+from deploy import extras
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
 from deploy.rundir import RunDir
 from deploy.site import place
+from deploy.which_robot import profile_of
 
 RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
 ENOUGH_GB = 1.0
@@ -51,17 +52,17 @@ app = typer.Typer()
 @app.command()
 def doctor(
     profile: ProfileArgument = "robot",
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Check a machine and its robot before a run; each line is well, or says what to do. Exit code 1 if not."""
-    sys.exit(print_checks(profile, json, description, measured))
+    sys.exit(print_checks(profile, json, robot, measured))
 
 
-def print_checks(profile_name: str, as_json: bool, description: Path | None, measured: Path | None) -> int:
+def print_checks(profile_name: str, as_json: bool, robot: str | None = None, measured: Path | None = None) -> int:
     """Prints all checks of a profile; the exit code is 1 when one found a problem."""
-    profile = profiles.read(profile_name).with_robot(description, measured)
+    profile = profile_of(profile_name, robot, measured)
     checks = list(examine(profile))
     if as_json:
         print_json([check._asdict() for check in checks])

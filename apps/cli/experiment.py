@@ -13,11 +13,14 @@ import typer
 
 from apps.cli import completions, exits
 from apps.cli.experiment_progress import RunProgress
-from apps.cli.options import DescriptionOption, FramesOption, JsonOption, MeasuredOption, frames_of
+from apps.cli.options import AnyRobotOption, FramesOption, JsonOption, MeasuredOption, frames_of
 from apps.cli.output import tell
 from apps.experiments.experiments import EXPERIMENTS, run
 from apps.experiments.plan import ExperimentSettings
 from cocoro.errors import ConfigError, choice_of
+from cocoro.robot_files import RobotFiles
+from deploy.which_robot import files_of
+from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 EVERY = "all"
 
@@ -46,7 +49,7 @@ def experiment(
     body: Annotated[
         str, typer.Option(metavar="nominal|worn", help="A body that equals the nominal model, or differs from it.")
     ] = "worn",
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     frames: FramesOption = None,
     samples: Annotated[
@@ -66,13 +69,23 @@ def experiment(
     """
     sys.exit(
         run_experiments(
-            which, seeds, out, sensors, body, (description, measured), frames, samples, jobs, not no_plots, json
+            which,
+            seeds,
+            out,
+            sensors,
+            body,
+            files_of(robot).with_measured(measured),
+            frames,
+            samples,
+            jobs,
+            not no_plots,
+            json,
         )
     )
 
 
 def run_experiments(
-    which: str, seeds: int, out: Path, sensors: str, body: str, robot_files: tuple[Path | None, Path | None],
+    which: str, seeds: int, out: Path, sensors: str, body: str, files: RobotFiles,
     frames: str | None, samples: int, jobs: int | None, plots: bool, as_json: bool = False,
 ) -> int:  # fmt: skip
     """Runs, writes the report, prints its tables; the exit code is 1 when a run failed.
@@ -85,13 +98,16 @@ def run_experiments(
     for name, value, known in (("sensors", sensors, ("ideal", "real")), ("body", body, ("nominal", "worn"))):
         if value not in known:
             raise ConfigError(f"--{name} {value}: {choice_of(value, known)}")
-    description, measured = (None if file is None else str(file.resolve()) for file in robot_files)
+    measured = None if files.measured is None else str(files.measured.resolve())
     settings = ExperimentSettings(
         seeds=tuple(range(seeds)), out=out.resolve(), sensors="real" if sensors == "real" else "ideal",
         body="worn" if body == "worn" else "nominal", samples=samples, jobs=jobs or os.cpu_count() or 1,
-        description=description, measured=measured,
+        description=None if files.description is None else str(files.description), measured=measured,
     )  # fmt: skip
-    settings.robot()  # refuses files that cannot be read before the first run
+    if lack := settings.robot().lacks(
+        (*BabbleArmTask.needs_body, *BabbleWheelsTask.needs_body)
+    ):  # files that cannot be read are refused, too
+        raise ConfigError(f"{lack}: every experiment begins with learning the body from the sight of its hand")
     if frames:
         settings = msgspec.structs.replace(settings, **frames_of(frames))
     progress = RunProgress(sys.stderr, settings.jobs)

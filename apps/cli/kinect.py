@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import exits
-from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileOption
+from apps.cli.options import AnyRobotOption, JsonOption, MeasuredOption, ProfileOption
 from apps.cli.output import tell
 from apps.cli.toml_files import write_values
 from cocoro.component import load
@@ -21,6 +21,7 @@ from deploy import profiles
 from deploy.processes import named
 from deploy.profiles import Profile
 from deploy.rundir import RunDir
+from deploy.which_robot import profile_of
 from services.kinect import calibration, tools
 
 LARGEST_SQUARE_MM = 500.0
@@ -45,7 +46,7 @@ def calibrate(
         Path | None, typer.Option(metavar="FOLDER", help="Keep the views here, to calibrate from them again.")
     ] = None,
     profile: ProfileOption = "robot",
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     write: Annotated[
         Path | None,
@@ -54,7 +55,7 @@ def calibrate(
     json: JsonOption = False,
 ) -> None:
     """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
-    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write, description, measured, json))
+    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write, robot, measured, json))
 
 
 @kinect.command()
@@ -68,13 +69,13 @@ def tilt(
 
 def calibrate_from_views(
     profile_name: str, size: str, square_mm: float, views: int, source: Path | None, keep: Path | None,
-    write: Path | None, description: Path | None = None, measured: Path | None = None, as_json: bool = False,
+    write: Path | None, which: str | None = None, measured: Path | None = None, as_json: bool = False,
 ) -> int:  # fmt: skip
     """Takes views or reads them from `source`, calibrates, and writes the result into the robot's measured file.
 
     Raises ConfigError for an impossible board or square, RefusedError while the Kinect's service runs.
     """
-    profile = profiles.read(profile_name).with_robot(description, measured)
+    profile = profile_of(profile_name, which, measured)
     robot, file = _robot(profile, write)
     board = calibration.Board(*_board(size), _square_m(square_mm))
 

@@ -13,7 +13,6 @@ import typer
 
 from apps.cli.link import joined
 from apps.cli.options import (
-    DescriptionOption,
     JsonOption,
     MeasuredOption,
     ModelOutOption,
@@ -31,6 +30,7 @@ from cocoro.learning.model import BodyModel, encode
 from cocoro.messages import ModelRequest
 from cocoro.robot import Robot
 from cocoro.topics import LEARNED
+from deploy.which_robot import files_here
 
 app = typer.Typer()
 learn = typer.Typer(no_args_is_help=True, help="Learn a model for the planner from the samples of babbling.")
@@ -47,7 +47,6 @@ def learn_arm(
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="Use this method instead of the one with the smallest error.")
     ] = None,
-    description: DescriptionOption = None,
     measured: MeasuredOption = None,
     send: SendOption = False,
     robot: RobotOption = None,
@@ -56,7 +55,7 @@ def learn_arm(
 ) -> None:
     """Learn the hand-eye map by every method, measure each on held-out samples, and write the best."""
     model, text = learn_arm_model(
-        samples, into, Robot.load(description, measured), search=search, method=method, as_json=json
+        samples, into, files_here(robot).with_measured(measured).load(), search=search, method=method, as_json=json
     )
     print(text)
     if send:
@@ -69,7 +68,6 @@ def learn_wheels(
         "wheels.jsonl"
     ),
     into: ModelOutOption = Path("model.json"),
-    description: DescriptionOption = None,
     measured: MeasuredOption = None,
     send: SendOption = False,
     robot: RobotOption = None,
@@ -77,7 +75,7 @@ def learn_wheels(
     json: JsonOption = False,
 ) -> None:
     """Learn the distance between the wheels."""
-    model, text = learn_wheel_model(samples, into, Robot.load(description, measured), as_json=json)
+    model, text = learn_wheel_model(samples, into, files_here(robot).with_measured(measured).load(), as_json=json)
     print(text)
     if send:
         send_model(RobotChoice(robot, site), model, json)

@@ -23,6 +23,7 @@ from cocoro.errors import ConfigError, choice_of
 from cocoro.private import default_run_dir
 from deploy.processes import components
 from deploy.rundir import RunDir, folders
+from deploy.which_robot import up_here
 
 LOOK_S = 0.2
 """Time between two looks for new lines."""
@@ -66,7 +67,7 @@ class LogEntry(NamedTuple):
 def robot_of(robot: str | None) -> RunDir:
     """Run directory of the robot, up or not. Raises ConfigError when several have logs, or none."""
     if robot is not None:
-        run_dir = RunDir(robot)
+        run_dir = up_here(robot)
         if not run_dir.logs.is_dir():
             raise ConfigError(f"there are no logs of {robot} in {run_dir.logs}")
         return run_dir

@@ -7,6 +7,7 @@ from pathlib import Path
 from apps.cli import exits
 from apps.cli.new_files import check_name, free_folder, put, tell_of
 from apps.urdf.describing import describe
+from apps.urdf.things import objects_text, scene_texts
 from apps.urdf.writing import PAGE, description_text, page_text, profile_text
 
 
@@ -15,7 +16,7 @@ def write_robot(name: str, urdf: Path, into: Path, as_json: bool = False) -> int
     URDF of which no description can be made, and for a file that cannot be written."""
     check_name(name)
     folder = free_folder(name, into)
-    made = describe(urdf, name)
+    made = describe(urdf, name, postures=True)
     source = "".join(letter if letter.isprintable() else "?" for letter in urdf.name)
     profile = folder / f"{name}-sim.toml"
     files = {
@@ -23,9 +24,13 @@ def write_robot(name: str, urdf: Path, into: Path, as_json: bool = False) -> int
         profile: profile_text(name),
         folder / PAGE: page_text(name, source, made.missing),
     }
+    if (objects := objects_text(name, made.robot)) is not None:
+        files[folder / f"{name}-objects.toml"] = objects
+    files |= {folder / f"{name}-{scene}.toml": text for scene, text in scene_texts(name, made.robot)}
     for path, text in files.items():
         put(path, text)
     hints = (
+        (f"cocoro rehearse go-to red_can --robot {folder / name}.toml", "tries a task in simulation"),
         (f"cocoro up {profile}", "runs it in the simulator"),
         (f"cocoro doctor {profile}", "checks the profile and the robot"),
     )

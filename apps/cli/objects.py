@@ -12,7 +12,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import joined
-from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, RobotChoice, RobotOption, ThroughOption
+from apps.cli.options import JsonOption, MeasuredOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import print_json
 from apps.cli.snapshot import check
 from apps.cli.terminal import Column, print_table
@@ -73,7 +73,6 @@ def learn(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the colours of a known object.")] = False,
     add: Annotated[bool, typer.Option("--add", help="Add the colours of another light to a known object.")] = False,
-    description: DescriptionOption = None,
     measured: MeasuredOption = None,
     robot: RobotOption = None,
     site: ThroughOption = None,
@@ -84,7 +83,7 @@ def learn(
     Prints and draws what would match before it saves anything, and warns of known objects that look alike.
     """
     from apps.cli import learn_object as learning  # slow to import: OpenCV and the components
-    from cocoro.robot import Robot
+    from deploy.which_robot import files_here
 
     hints = learning.hints_of(
         label, at_px=learning.pixel_of(at), box_px=learning.box_of(box), shape=shape, size_m=learning.size_of(size),
@@ -93,7 +92,7 @@ def learn(
     if picture is not None:
         check(picture)
     saving = learning.SaveOptions(catalogue, picture, yes, replace, add, json)
-    camera_of = Robot.load(description, measured)
+    camera_of = None if source == learning.LIVE else files_here(robot).with_measured(measured).load()
     sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, site), source, hints, saving, camera_of)))
 
 

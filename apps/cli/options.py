@@ -23,16 +23,29 @@ def name_option(*names: str, help: str) -> Any:
     return typer.Option(metavar="|".join(names), autocompletion=completions.of(*names), help=help)
 
 
+NAME_OR_FILE = "NAME|FILE"
+
 # --- which robot, and how to print ----------------------------------------------------------------
 
 RobotOption = Annotated[
     str | None,
     typer.Option(
         "--robot",
+        metavar=NAME_OR_FILE,
         autocompletion=completions.robots,
-        help="Name of the robot; needed only when several are up on this machine.",
+        help="The robot: its name, or the file of its description; needed only when several are up on this machine.",
     ),
 ]
+AnyRobotOption = Annotated[
+    str | None,
+    typer.Option(
+        "--robot",
+        metavar=NAME_OR_FILE,
+        autocompletion=completions.described,
+        help="The robot: calliope, lekiwi, one that is up here, or the file of its description.",
+    ),
+]
+"""Of commands whose robot need not be up."""
 ThroughOption = Annotated[
     str | None,
     typer.Option(
@@ -106,12 +119,6 @@ ObjectsOption = Annotated[
 BodyOption = Annotated[
     str,
     name_option("nominal", "worn", help="A body like the nominal model, or one that differs."),
-]
-DescriptionOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--description", metavar="FILE", help="Description of the robot, if it is not the Calliope, or: lekiwi."
-    ),
 ]
 MeasuredOption = Annotated[
     Path | None,

@@ -78,7 +78,7 @@ async def record_mesh(
     async with joined(choice, frames=True) as link:
         resolved = link.run_dir.resolved()
         clock = FollowedClock() if resolved.get("clock") == "sim" else link.clock
-        robot = link.described()
+        robot = await link.described()
         name = f"record-{os.getpid()}"
         async with Node(
             name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config, profile=resolved

@@ -18,6 +18,7 @@ from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.options import (
     AdaptOption,
+    AnyRobotOption,
     FramesOption,
     JsonOption,
     LatencyOption,
@@ -41,6 +42,7 @@ from cocoro.errors import CocoroError, ConfigError
 from deploy import extras, launch, profiles
 from deploy.profiles import Profile
 from deploy.rundir import RunDir, Target, robots, targets
+from deploy.which_robot import only, profile_of, up_here
 from services.cockpit.component import COCKPIT
 
 SENSORS, BODIES, REACHES = ("ideal", "real"), ("nominal", "worn"), ("learned", "rigid")
@@ -62,6 +64,7 @@ def up(
             autocompletion=completions.profiles,
         ),
     ] = None,
+    robot: AnyRobotOption = None,
     detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
     scene: SceneOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: seed of all random numbers.")] = None,
@@ -97,7 +100,10 @@ def up(
     if objects is not None:
         settings.insert(0, objects_of(objects))
     settings[:0] = model_of(model, reach, adapt)
-    read = profiles.read(profile or "sim", settings) if host is None else share_of(profile, site, host, settings)
+    if host is None:
+        read = profile_of(profile or "sim", robot, overrides=settings)
+    else:
+        read = share_of(profile, site, host, settings, robot)
     if no_cockpit:
         read = without_cockpit(read)
     extras.require(f"cocoro up {profile or ''}".strip(), read.rows())
@@ -133,10 +139,11 @@ def run(
             help="By default that of the robot that is up here, else sim.",
         ),
     ] = None,
+    robot: AnyRobotOption = None,
     set_: SetOption = None,
 ) -> None:
     """Run one process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
-    sys.exit(run_process(process, profile, set_ or []))
+    sys.exit(run_process(process, profile, set_ or [], robot))
 
 
 def without_cockpit(profile: Profile) -> Profile:
@@ -147,13 +154,17 @@ def without_cockpit(profile: Profile) -> Profile:
     return msgspec.structs.replace(profile, processes=left)
 
 
-def share_of(profile: str | None, site: Path | None, host: str, settings: list[str]) -> Profile:
-    """The profile of a host's share. Raises ConfigError for a profile that is named beside, or a site that cannot be
-    used."""
+def share_of(
+    profile: str | None, site: Path | None, host: str, settings: list[str], robot: str | None = None
+) -> Profile:
+    """The profile of a host's share. Raises ConfigError for a profile or a robot that is named beside, or a site that
+    cannot be used."""
     from deploy.site import place, plan
 
     if profile is not None:
         raise ConfigError(f"--host {host}: its robot's profile is in the site's plan; leave {profile} out")
+    if robot is not None:
+        raise ConfigError(f"--host {host}: its robot is in the site's plan; leave --robot {robot} out")
     return plan.read(place.folder(site)).share_profile(host, settings)
 
 
@@ -288,7 +299,7 @@ def _last_error(run_dir: RunDir) -> str:
 
 def stop_robots(robot: str | None, as_json: bool = False) -> int:
     """Stops one robot, or all that are up on this machine; returns the exit code."""
-    chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
+    chosen = [up_here(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
     stopped = [run_dir.robot for run_dir in chosen if _stop(run_dir, as_json)]
     shared.sweep()  # shared memory that killed processes left
     if as_json:
@@ -325,17 +336,14 @@ def _stop(run_dir: RunDir, quiet: bool = False) -> bool:
     return found
 
 
-def run_process(process: str, profile: str | None, settings: list[str]) -> int:
+def run_process(process: str, profile: str | None, settings: list[str], robot: str | None = None) -> int:
     """Runs one process in the foreground; returns its exit code. Raises ConfigError when the profile is not clear."""
-    if profile is None and not settings and (up_here := robots()):
-        if len(up_here) > 1:
-            raise ConfigError(
-                f"several robots are up ({', '.join(r.robot for r in up_here)}): choose one with --profile"
-            )
-        data = up_here[0].resolved()
+    running = [] if profile is not None or settings else [one for one in robots() if robot in (None, one.robot)]
+    if running:
+        data = only(running).resolved()
         read = profiles.from_data(data, data.get("name", "")) if data else profiles.read("sim")
     else:
-        read = profiles.read(profile or "sim", settings)
+        read = profile_of(profile or "sim", robot, overrides=settings)
     run_dir = RunDir(read.robot)
     run_dir.make()
     launch.set_up_logging(process)

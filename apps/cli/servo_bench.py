@@ -16,9 +16,9 @@ from cocoro.errors import ConfigError, choice_of
 from cocoro.joints import Joint, ServoPlace
 from cocoro.ports import port_path
 from cocoro.robot import Robot
-from deploy import profiles
 from deploy.processes import named
 from deploy.profiles import Profile
+from deploy.which_robot import profile_of
 from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.families import FAMILIES
@@ -51,10 +51,11 @@ class ServoWorkbench:
 
     @classmethod
     def of(
-        cls, profile_name: str, write: Path | None, description: Path | None = None, measured: Path | None = None
+        cls, profile_name: str, write: Path | None, which: str | None = None, measured: Path | None = None
     ) -> ServoWorkbench:
-        """Raises ConfigError for a profile or a robot description that cannot be read."""
-        profile = profiles.read(profile_name).with_robot(description, measured)
+        """`which` is a robot as `--robot` has it, by default the profile's. Raises ConfigError for a profile or a robot
+        description that cannot be read."""
+        profile = profile_of(profile_name, which, measured)
         description, measured = profile.robot_files
         existing = measured if measured is not None and measured.exists() else None
         robot = Robot.load(description, existing)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import exits
-from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileOption
+from apps.cli.options import AnyRobotOption, JsonOption, MeasuredOption, ProfileOption
 from apps.cli.output import complain, print_json
 from apps.cli.servo_bench import BaudOption, PortOption, ServoWorkbench, WriteOption
 from apps.cli.terminal import print_table
@@ -44,13 +44,13 @@ def import_lerobot(
     port: PortOption = None,
     baud: BaudOption = None,
     write: WriteOption = None,
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Take over zeros and limits from a calibration by LeRobot, of Feetech servos as in an SO-101 or a LeKiwi."""
     motors = lerobot.read(_content(file), str(file))
-    bench = ServoWorkbench.of(profile, write, description, measured)
+    bench = ServoWorkbench.of(profile, write, robot, measured)
     if line is not None and line not in bench.robot.networks:
         raise ConfigError(f"there is no line {line!r}; {choice_of(line, bench.robot.networks)}")
     nominal = Robot.load(bench.profile.robot_files[0]).joints

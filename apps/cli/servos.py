@@ -14,7 +14,7 @@ import typer
 from apps.cli import completions, exits
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import (
-    DescriptionOption,
+    AnyRobotOption,
     JsonOption,
     MeasuredOption,
     ProfileOption,
@@ -97,7 +97,7 @@ async def request(choice: RobotChoice, action: str, joints: list[str], as_json: 
     """
     code, done = exits.DONE, list[dict[str, Any]]()
     async with joined(choice) as link:
-        groups = _groups_of(joints, link.described())
+        groups = _groups_of(joints, await link.described())
         alive = await link.alive()
         missing = [group for group in groups if group not in alive]
         if missing:
@@ -151,12 +151,12 @@ def scan(
     write: Annotated[
         Path | None, typer.Option("--write", metavar="FILE", help="Write the ports that were found into this profile.")
     ] = None,
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Find servos on every serial port, at every baud rate. The robot must be down."""
-    bench = ServoWorkbench.of(profile, None, description, measured)
+    bench = ServoWorkbench.of(profile, None, robot, measured)
     sys.exit(scan_ports(bench, port or [], baud or [], last, write, json))
 
 
@@ -265,11 +265,11 @@ def calibrate(
     port: PortOption = None,
     baud: BaudOption = None,
     write: WriteOption = None,
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
 ) -> None:
     """Measure a joint's zero and direction while you turn it by hand. The robot must be down."""
-    bench = ServoWorkbench.of(profile, write, description, measured)
+    bench = ServoWorkbench.of(profile, write, robot, measured)
     for joint in [bench.joint(name) for name in joints]:
         with bench.line(joint, port, baud) as line:
             bench.write(joint, tools.calibrate(line, joint, at, _wait_for_enter))
@@ -282,11 +282,11 @@ def limits(
     port: PortOption = None,
     baud: BaudOption = None,
     write: WriteOption = None,
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
 ) -> None:
     """Measure a joint's limits while you turn it by hand from end to end. The robot must be down."""
-    bench = ServoWorkbench.of(profile, write, description, measured)
+    bench = ServoWorkbench.of(profile, write, robot, measured)
     for joint in [bench.joint(name) for name in joints]:
         with bench.line(joint, port, baud) as line:
             print(f"{joint.name} is limp: turn it from end to end, then press Enter")

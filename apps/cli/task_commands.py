@@ -21,12 +21,13 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from apps.cli import completions
+from apps.cli.former import taking_former
 from apps.cli.listed import COMMANDS
 from apps.cli.options import (
     AdaptOption,
+    AnyRobotOption,
     BodyOption,
     CameraOption,
-    DescriptionOption,
     FramesOption,
     InsteadOption,
     JsonOption,
@@ -97,7 +98,7 @@ def rehearse(
         name_option("ideal", "real", help="Perfect camera and body, or real ones."),
     ] = "ideal",
     body: BodyOption = "nominal",
-    description: DescriptionOption = None,
+    robot: AnyRobotOption = None,
     measured: MeasuredOption = None,
     model: ModelOption = None,
     reach: ReachOption = None,
@@ -134,13 +135,16 @@ def rehearse(
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
     from apps.cli import rehearse as rehearsing
+    from deploy.which_robot import files_of
 
+    files = files_of(robot).with_measured(measured)
     options = {
         "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
         "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples), "lockstep": lockstep,
-        "description": _text(description), "measured": _text(measured),
+        "description": _text(files.description), "measured": _text(files.measured),
         "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
-        "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
+        "objects": _text(objects or files.objects), "timeout_s": timeout, "picture": _text(picture),
+        "record": _text(record),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
@@ -205,7 +209,7 @@ class RehearsalGroup(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if _is_known(cmd_name) and cmd_name not in _NAMES:
-            return _command(cmd_name, rehearse)
+            return taking_former(_command(cmd_name, rehearse))
         if ctx is not None and not ctx.resilient_parsing and not cmd_name.startswith("-"):
             ctx.fail(f"There is no task {cmd_name!r}; {choice_of(cmd_name, self.list_commands(ctx))}")
         return None

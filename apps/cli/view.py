@@ -189,7 +189,7 @@ async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> i
                 recording.connect_grpc(address)
             waiting = Waiting()
             watch(link.bus, link.robot, waiting)
-            scene = RerunScene(recording, link.described(), link.catalogue(), stage)
+            scene = RerunScene(recording, await link.described(), link.catalogue(), stage)
             writing = Attempt(partial(waiting.log_to, scene))
             print(f"at {viewer.page}\nCtrl-C ends it" if viewer and viewer.page else "Ctrl-C ends it", flush=True)
             with interrupt_event() as end:

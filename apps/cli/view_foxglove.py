@@ -88,7 +88,7 @@ async def serve(choice: RobotChoice, place: Place) -> int:
         asked = Asked(link, asyncio.get_running_loop(), local=through_site(choice) is None)
         topics = [topic for topic in TOPICS if PER_SERVICE not in topic.name]
         with FoxgloveServer(
-            link.robot, link.described(), link.catalogue(), topics,
+            link.robot, await link.described(), link.catalogue(), topics,
             host=hidden_address(), port=0, services=asked.services(operate=place.operate),
         ) as server:  # fmt: skip
             peers = Peers()

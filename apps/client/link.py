@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -12,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 from apps.client.choice import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.errors import ConfigError, MeshError, RefusedError, choice_of
+from cocoro.errors import MeshError, RefusedError, choice_of
 from cocoro.participant import Answer, Q, R
 from cocoro.topics import Request
 from deploy.rundir import START, RunDir, robots
 from deploy.site.place import SITE
 from deploy.survey import REPLAY, Onlooker
+from deploy.which_robot import only, started_with, up_here
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue
@@ -27,7 +29,6 @@ __all__ = ["Answer", "MeshLink", "find", "joined"]
 
 PERCEPTION = "perception"
 """The component that detects the known objects."""
-ROBOT_FILES = ("description", "measured")
 
 
 class MeshLink(Onlooker):
@@ -48,13 +49,14 @@ class MeshLink(Onlooker):
             raise RefusedError(why)  # the gateway would drop it, and nobody would answer
         return await super()._ask(request, question, timeout_s)
 
-    def described(self) -> Robot:
-        """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
-        ConfigError."""
-        from cocoro.robot import Robot  # slow to import; few commands need it
+    async def described(self) -> Robot:
+        """The robot by the files that it was started with, if it is on this machine; else as its services state it.
+        Raises ConfigError; MeshError where no service of another machine's robot states it."""
+        if self.here:
+            return await asyncio.to_thread(started_with(self.run_dir).load)
+        from apps.client.stated import stated_robot  # slow to import; few commands need it
 
-        resolved = self.run_dir.resolved()
-        return Robot.load(*(Path(file) if (file := resolved.get(name)) else None for name in ROBOT_FILES))
+        return await stated_robot(self)
 
     def catalogue(self) -> Catalogue:
         """The objects that the running robot knows, if their file is on this machine; else the project's own. Raises
@@ -98,13 +100,11 @@ def through_site(choice: RobotChoice) -> str | None:
 def find(choice: RobotChoice) -> RunDir:
     """The robot that a command is for. Raises MeshError when none is up, ConfigError when several are."""
     if choice.robot is not None:
-        return RunDir(choice.robot)
+        return up_here(choice.robot)
     up = robots()
     if not up:
         raise MeshError(f"no robot is up on this machine: {START}")
-    if len(up) > 1:
-        raise ConfigError(f"several robots are up; choose one: {', '.join(f'--robot {r.robot}' for r in up)}")
-    return up[0]
+    return only(up)
 
 
 @asynccontextmanager

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
+from functools import partial
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -12,6 +13,7 @@ from apps.client import reading, seeing, status, stopping
 from apps.client.drive import Drive
 from apps.client.handle import TaskHandle, unknown_task
 from apps.client.seeing import View
+from apps.client.stated import stated_robot
 from apps.client.status import RobotStatus
 from apps.client.stopping import Released, StopPath, Stopped
 from cocoro.contact import Contact
@@ -52,16 +54,17 @@ class RobotClient:
         participant: Participant,
         *,
         contact: Contact | None = None,
-        described: Callable[[], Robot] | None = None,
+        described: Callable[[], Awaitable[Robot]] | None = None,
         stop_path: StopPath | None = None,
         by: str = "operator",
     ) -> None:
         """On the mesh of any bus, in virtual time, too; the participant is the caller's to close. `contact` knows what
-        became of an executive that is not heard; `described` returns the robot's description, by default that of the
-        Calliope; `stop_path` stops the robot on this machine beside the mesh; `by` is who stops and releases it."""
+        became of an executive that is not heard; `described` finds the robot's description, by default that which
+        its services state; `stop_path` stops the robot on this machine beside the mesh; `by` is who stops and releases
+        it."""
         self.participant = participant
         self._contact = contact
-        self._described = described or Robot.load
+        self._described = described or partial(stated_robot, participant)
         self._stop_path = stop_path
         self._by = by
         self._handles: list[TaskHandle] = []
@@ -176,8 +179,7 @@ class RobotClient:
         pairs.open()
         frame, seen = await pairs.take(detections_s=seeing.DETECTIONS_S if detections else 0.0)
         if self._description is None:
-            virtual = self.participant.clock.virtual  # there no thread can be waited for
-            self._description = self._described() if virtual else await asyncio.to_thread(self._described)
+            self._description = await self._described()
         return View(frame, seen, self._description)
 
     async def objects(self) -> tuple[KnownObject, ...]:

@@ -7,8 +7,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from cocoro.robot_files import objects_beside, scene_beside
 from services.executive.tasks import TASKS
 from sim.kinds import BodyKind, Sensors
+from sim.scene_names import DEFAULT
 
 
 class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -22,8 +24,8 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Further tasks, as `task`, one after the other. The first task that fails is the last."""
     samples: str | None = None
     """File that the reported samples are appended to. The task continues after the last sample in it."""
-    scene: str = "paper"
-    """A scene's name, or the path of a scene file."""
+    scene: str = DEFAULT
+    """A scene's name, or the path of a scene file. Of a robot that has its own scene of that name, it is that."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Sensors = "ideal"
     body: BodyKind = "nominal"
@@ -56,7 +58,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     picture: str | None = None
     """File for the last picture of the task's snapshot phase (PNG)."""
     objects: str | None = None
-    """File of known objects in place of the project's own."""
+    """File of known objects in place of the robot's own, or the project's."""
     seen_within_m: Annotated[float, Meta(gt=0, le=3)] | None = None
     """Judge by the truth which floor the camera saw within this distance of where the tasks began."""
     trace: bool = False
@@ -67,3 +69,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "task", TASKS.read(self.task))
         msgspec.structs.force_setattr(self, "then", tuple(TASKS.read(task) for task in self.then))
+        if self.objects is None and (objects := objects_beside(self.description)) is not None:
+            msgspec.structs.force_setattr(self, "objects", str(objects))
+        if (scene := scene_beside(self.description, self.scene)) is not None:
+            msgspec.structs.force_setattr(self, "scene", str(scene))

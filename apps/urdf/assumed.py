@@ -20,6 +20,10 @@ from sim.body import CASTER_RADIUS_M
 
 LIMITS_DEG, TORQUE_NM, SPEED_RADPS = (-150.0, 150.0), 3.0, 3.0
 """Of a joint for which the URDF has none."""
+MOST_NM = 500.0
+"""A torque from here on is that of a file that was not filled in, and would throw a small robot about."""
+AHEAD_M = 0.08
+"""Of the assumed base's middle, the root of a URDF that has no wheels: an arm amid the base hardly reaches past it."""
 CHASSIS_DIAMETER_M, CHASSIS_HEIGHT_M, CHASSIS_KG = 0.30, 0.04, 5.0
 WHEEL_SEPARATION_M, WHEEL_RADIUS_M = 0.24, 0.03
 LOAD_KG = 1.5
@@ -74,7 +78,8 @@ def body_of(urdf: Urdf, roles: Roles) -> Body:
         still = [link for link in urdf.links if not any(joint.name in roles.joints for joint in urdf.moving(link))]
         lowest = lowest_m(urdf, still)
         height_m = 0.0 if roles.wheels and lowest is not None else top_m
-        root = Origin((0.0, 0.0, rounded(height_m - (lowest or 0.0), 6)), (0.0, 0.0, 0.0))
+        ahead_m = 0.0 if roles.wheels else AHEAD_M
+        root = Origin((ahead_m, 0.0, rounded(height_m - (lowest or 0.0), 6)), (0.0, 0.0, 0.0))
     return Body(root, (CAMERA_M[0], CAMERA_M[1], CAMERA_M[2] + top_m), rolling)
 
 
@@ -108,6 +113,11 @@ def claw_of(hand: Hand) -> dict[str, Any]:
         "pad_thickness_m": PAD_THICKNESS_M,
     }
     return claw if hand.fixed_pad_m is None else claw | {"fixed_pad_m": rounded(hand.fixed_pad_m, 4)}
+
+
+def torque_nm(effort_nm: float | None) -> float:
+    """A servo's torque by what the URDF says."""
+    return TORQUE_NM if effort_nm is None or effort_nm >= MOST_NM else effort_nm
 
 
 def lines() -> dict[str, Any]:

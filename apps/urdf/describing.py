@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from apps.urdf.assumed import LIMITS_DEG, LINE, SPEED_RADPS, TORQUE_NM, body_of, camera_of, claw_of, lines
+from apps.urdf.assumed import LIMITS_DEG, LINE, SPEED_RADPS, body_of, camera_of, claw_of, lines, torque_nm
 from apps.urdf.hand import hand_of
 from apps.urdf.missing import Missing, missing_of
 from apps.urdf.model import Urdf
 from apps.urdf.parts import Parts, carriers
+from apps.urdf.posture import postures_of, straight_deg
 from apps.urdf.reading import read
 from apps.urdf.roles import Roles, roles_of
 from apps.urdf.rows import Rows, rounded
+from apps.urdf.things import can_m
 from apps.urdf.values import UrdfError
 from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
@@ -39,17 +41,18 @@ class Made:
     robot: Robot
 
 
-def describe(path: Path, name: str) -> Made:
-    """Make the description of the robot `name` from the URDF in a file. Raises ConfigError as `reading.read` does, and
-    for a robot without an arm."""
+def describe(path: Path, name: str, *, postures: bool = False) -> Made:
+    """Make the description of the robot `name` from the URDF in a file; with `postures` chosen by the arm's kinematics,
+    which takes a second, and the table of its reach. Raises ConfigError as `reading.read` does, and for a robot without
+    an arm."""
     urdf = read(path)
     try:
-        return _described(urdf, name)
+        return _described(urdf, name, postures)
     except UrdfError as error:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def _described(urdf: Urdf, name: str) -> Made:
+def _described(urdf: Urdf, name: str, postures: bool) -> Made:
     roles = roles_of(urdf)
     hand = hand_of(urdf, roles)
     body = body_of(urdf, roles)
@@ -74,6 +77,12 @@ def _described(urdf: Urdf, name: str) -> Made:
     data["solid"] = _solid(urdf, roles, rows, parts)
     try:
         robot = Robot.from_data({"head": None} | data, "the description made of it")
+        if straight_deg(robot) is not None:
+            data["arm"]["straight_deg"] = straight_deg(robot)
+            robot = Robot.from_data({"head": None} | data, "the description made of it")
+        if postures and (chosen := postures_of(robot, 2.0 * can_m(robot)[0])) is not None:
+            data |= {"reach": chosen.reach, "pose": chosen.poses}
+            robot = Robot.from_data({"head": None} | data, "the description made of it")
     except ConfigError as error:
         raise UrdfError(str(error)) from error
     return Made(data, missing_of(urdf, roles, hand, parts, body, data), robot)
@@ -87,7 +96,7 @@ def _joint(urdf: Urdf, name: str, roles: Roles) -> dict[str, Any]:
         "network": LINE,
         "id": roles.joints.index(name) + 1,
         "limits_deg": [rounded(low, 4), rounded(high, 4)],
-        "torque_nm": rounded(joint.effort_nm or TORQUE_NM),
+        "torque_nm": rounded(torque_nm(joint.effort_nm)),
         "max_speed_radps": rounded(joint.velocity_radps or SPEED_RADPS),
     }
 

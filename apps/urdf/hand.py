@@ -18,6 +18,8 @@ _AHEAD_M = 0.05
 """From the jaws' axes to the point between them, where the URDF has no link for it."""
 _LEAST_REACH_M = 0.01
 _LEAST_M = 0.001
+_EVEN_RAD = 0.02
+"""Limits count as even whose ends differ by less."""
 _ALONG = 0.8
 """Least cosine between the z axis of a link and the hand of which it is the tip."""
 _ALONG_ONE = 0.995
@@ -40,7 +42,7 @@ class Hand:
     pad_length_m: float
     pad_gap_m: float
     open_sign: dict[str, float]
-    """Jaws open towards the farther end of their limits."""
+    """Jaws open towards the farther end of their limits; of a pair whose limits are even, away from the roll axis."""
     fixed_pad_m: float | None
     """With one jaw: distance of the other finger's face from the tip's axis."""
     pads_known: bool
@@ -80,7 +82,7 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
     palm = poses[urdf.joints[roles.roll].child]
     point, along = (palm @ place)[:3, 3], (palm @ place)[:3, 2]
     frames, finger_deg, reaches, offsets = {}, {}, [], []
-    signs = {jaw: _opens(urdf.joints[jaw]) for jaw in roles.jaws}
+    signs: dict[str, float] = {}
     only = roles.jaws[0] if len(roles.jaws) == 1 else None
     for jaw in roles.jaws:
         joint = urdf.joints[jaw]
@@ -91,6 +93,7 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
         y = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else turn_to(z)[:3, 1]
         offset = float((pivot - palm[:3, 3]) @ np.cross(y, z))
         side = -1.0 if offset < 0.0 else 1.0
+        signs[jaw] = _opens(urdf.joints[jaw]) or (1.0 if jaw == only else -side)
         if jaw == only:
             side = -signs[jaw]  # it opens away from the fixed finger, wherever its axis is
         frame = np.eye(4)
@@ -113,8 +116,9 @@ def _with_jaws(urdf: Urdf, roles: Roles, tip: str | None, place: FloatArray) -> 
 
 
 def _opens(joint: UrdfJoint) -> float:
+    """The sign of the farther end of its limits; 0 where they are even."""
     low, high = joint.limits_rad or (-1.0, 1.0)
-    return -1.0 if -low > high else 1.0
+    return 0.0 if abs(low + high) < _EVEN_RAD else -1.0 if -low > high else 1.0
 
 
 def _hand_frame(palm: FloatArray, roll: UrdfJoint, outward: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import degrees
 from typing import Any, NamedTuple
 
-from apps.urdf.assumed import CAMERA_DOWN_DEG, LIMITS_DEG, LINE, LOAD_KG, SPEED_RADPS, TORQUE_NM, Body
+from apps.urdf.assumed import CAMERA_DOWN_DEG, LIMITS_DEG, LINE, LOAD_KG, SPEED_RADPS, TORQUE_NM, Body, torque_nm
 from apps.urdf.hand import Hand
 from apps.urdf.model import Urdf
 from apps.urdf.parts import ASSUMED_MASS_KG, Parts
@@ -31,7 +31,7 @@ class Missing(NamedTuple):
 def missing_of(
     urdf: Urdf, roles: Roles, hand: Hand, parts: Parts, body: Body, data: dict[str, Any]
 ) -> tuple[Missing, ...]:
-    rows = (*_never(roles, body, data), *_guessed(roles, hand, body, data), *_lacking(urdf, roles, parts))
+    rows = (*_never(roles, body, data), *_guessed(urdf, roles, hand, body, data), *_lacking(urdf, roles, parts))
     return tuple(sorted(rows, key=lambda row: (NEVER, GUESSED, FILE).index(row.section)))
 
 
@@ -61,9 +61,8 @@ def _never(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
             "what it sees is taken to be elsewhere",
         ),
         Missing(
-            NEVER, "postures: folded away, unfolded, hand in front", "`[pose.*]`",
-            "all joints at 0 or amid their limits; parked, turned to a side",
-            "the arm may strike itself on its way: set them before it moves",
+            NEVER, "postures: folded away, unfolded, hand in front; where the arm reaches", "`[pose.*]`, `[reach]`",
+            _postures(data), "the arm may strike itself on its way: set them before it moves",
         ),
         Missing(
             NEVER, "space that arm and hand take up, for keeping them clear", "`[hull]`",
@@ -83,6 +82,18 @@ def _never(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
             "the planner does not keep the arm off them",
         ),
     ]  # fmt: skip
+
+
+def _postures(data: dict[str, Any]) -> str:
+    if "reach" not in data:
+        return (
+            "all joints at 0 or amid their limits; parked, turned to a side; a Calliope's reach: with a level hand this"
+            " arm does not come clear to the floor"
+        )
+    low, high = data["reach"]["grasp_radius_range_m"]
+    return (
+        f"chosen by the arm's kinematics: it grasps {low:g} to {high:g} m from the axis of {data['arm']['joints'][0]}"
+    )
 
 
 def _base(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
@@ -135,7 +146,7 @@ def _base(roles: Roles, body: Body, data: dict[str, Any]) -> list[Missing]:
     return rows
 
 
-def _guessed(roles: Roles, hand: Hand, body: Body, data: dict[str, Any]) -> list[Missing]:
+def _guessed(urdf: Urdf, roles: Roles, hand: Hand, body: Body, data: dict[str, Any]) -> list[Missing]:
     arm = data["arm"]
     limb = f"{', '.join(arm['joints'])}; bend {arm['bend']}, roll {arm['roll']}"
     rows = [
@@ -151,6 +162,10 @@ def _guessed(roles: Roles, hand: Hand, body: Body, data: dict[str, Any]) -> list
     ]  # fmt: skip
     signs = ", ".join(f"{jaw} {'+' if sign > 0 else '-'}" for jaw, sign in hand.open_sign.items())
     rows.append(Missing(GUESSED, "the way in which the jaws open", "`[claw] open_sign`", signs, "it closes to open"))
+    if led := [name for name in roles.jaws if urdf.joints[name].mimics is not None]:
+        what = f"the servo of {', '.join(led)}, which mimics {urdf.joints[led[0]].mimics}"
+        now = "one of its own, as every joint has"
+        rows.append(Missing(GUESSED, what, "`[[joint]]`", now, "a real hand with one servo for both does not close"))
     if hand.fixed_pad_m is not None:
         how = "as of the solids beside the tip" if hand.pads_known else "assumed: no solids lie on its two sides alone"
         rows.append(
@@ -203,7 +218,8 @@ def _lacking(urdf: Urdf, roles: Roles, parts: Parts) -> list[Missing]:
             )
     given = {(urdf.joints[name].effort_nm, urdf.joints[name].velocity_radps) for name in roles.joints}
     if len(given) == 1 and None not in (alike := given.pop()):
-        now = f"{alike[0]:g} N m and {alike[1]:g} rad/s for every joint, as of a file that was not filled in"
+        now = f"{torque_nm(alike[0]):g} N m and {alike[1]:g} rad/s for every joint, as of a file that was not filled in"
+        now += f", which has {alike[0]:g} N m" if torque_nm(alike[0]) != alike[0] else ""
         fields = "`[[joint]] torque_nm`, `max_speed_radps`"
         rows.append(Missing(FILE, "torque and speed", fields, now, "the simulated servos are stronger or weaker"))
     return rows

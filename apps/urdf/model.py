@@ -65,6 +65,8 @@ class UrdfJoint:
     limits_rad: tuple[float, float] | None = None
     effort_nm: float | None = None
     velocity_radps: float | None = None
+    mimics: str | None = None
+    """The joint that it follows, by one servo for both."""
 
     @property
     def moves(self) -> bool:

@@ -139,12 +139,9 @@ def _joint(element: Element) -> UrdfJoint:
     if kind not in KINDS:
         raise UrdfError(
             f"{where} is of type {kind!r}: a description has joints that turn (revolute, continuous) and fixed ones;"
-            " fix it in a copy of the file"
+            " in a copy of the file make it one of them: a finger that slides may turn instead"
         )
-    if element.find("mimic") is not None:
-        raise UrdfError(
-            f"{where} mimics another joint: in a description each joint has its own servo; fix it in a copy of the file"
-        )
+    mimic = element.find("mimic")
     parent, child = (_end(element, tag, where) for tag in ("parent", "child"))
     place = origin(element, where)
     if kind == FIXED:
@@ -164,6 +161,7 @@ def _joint(element: Element) -> UrdfJoint:
     return UrdfJoint(
         name, kind, parent, child, place, (x / length, y / length, z / length), limits,
         _positive(limit, "effort", where), _positive(limit, "velocity", where),
+        None if mimic is None else mimic.get("joint", ""),
     )  # fmt: skip
 
 

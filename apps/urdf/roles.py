@@ -73,6 +73,11 @@ def roles_of(urdf: Urdf) -> Roles:
     jaws = tuple(sorted(below[roll], key=lambda name: not _is_jaw(urdf.joints[name]))[:_MOST_JAWS])
     if not jaws:
         raise UrdfError(f"has no hand that closes: no joint turns behind {roll}, the last one of its arm")
+    if led := [name for name in joints if urdf.joints[name].mimics is not None and name not in jaws]:
+        raise UrdfError(
+            f"joint {led[0]} mimics {urdf.joints[led[0]].mimics}: in a description each joint has its own servo; in a"
+            " copy of the file take out its <mimic>, or make it fixed"
+        )
     axes = {name: _axis(urdf, name) for name in chain}
     bends = [two for one, two in pairwise(arm) if abs(float(axes[one] @ axes[two])) > _PARALLEL]
     bend = bends[0] if bends else arm[len(arm) // 2]

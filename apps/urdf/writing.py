@@ -14,12 +14,13 @@ _TABLES = {
     "camera": "Assumed: a Kinect's lens and depth.",
     "head": "The joints that turn the camera.",
     "arm": "Guessed from the joints' order and names.",
+    "reach": "Chosen by the arm's kinematics: where a level hand comes to the floor clear of the base.",
     "link": "From the URDF: places of its joints. A joint about another axis than z has two rows.",
     "network": "Assumed: one servo line.",
     "joint": "Limits, torque and speed from the URDF where it has them; lines and IDs are to be set.",
     "claw": "Assumed.",
     "hull": "Assumed: balls along the arm.",
-    "pose": "Assumed: all joints at 0.",
+    "pose": "Chosen by the arm's kinematics, or all joints at 0.",
     "solid": "From the URDF: shapes, and for each link that moves a box that has its mass and touches nothing.",
 }
 

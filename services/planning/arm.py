@@ -57,7 +57,8 @@ class ArmController:
         self._park = {name: robot.poses["park"][name] for name in self._names}
         upright, self._bend = robot.poses["upright"], robot.arm.bend
         self._front_rad = upright[self._azimuth]
-        self._bend_sign = float(np.sign(upright[self._bend]))
+        self._straight_rad = robot.arm.straight_rad
+        self._bend_sign = float(np.sign(upright[self._bend] - self._straight_rad))
         self._out = {name: robot.poses["unfolded"][name] for name in self._names[1:]}
         """Unfolded in the plane that the arm is in: the hand points away from the arm's foot, level."""
         self._reference: dict[str, float] | None = None
@@ -182,7 +183,7 @@ class ArmController:
         return self._joints(goals, dt_s, speed_radps)
 
     def _is_astray(self, reference: Mapping[str, float], pose: HandPose) -> bool:
-        bent_back = self._bend_sign * reference[self._bend] < -_NEAR_RAD
+        bent_back = self._bend_sign * (reference[self._bend] - self._straight_rad) < -_NEAR_RAD
         self._astray |= abs(pose.pitch_rad - self._config.pitch_rad) > _ASTRAY_RAD or bent_back
         return self._astray
 

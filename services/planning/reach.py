@@ -95,7 +95,8 @@ class Reacher:
         return hypot(x, y), atan2(y, x), point_m[2]
 
     def step(self, angles: Mapping[str, float], pose: HandPose) -> FloatArray:
-        """Angles (4,), rad, of the arm's joints in their order, one step nearer to a hand pose.
+        """Angles (n,), rad, of the arm's joints in their order, one step nearer to a hand pose; of more joints than
+        four the change is the smallest.
 
         A joint that a step would carry over its limit is put on the limit and the others are solved again.
         """
@@ -110,9 +111,9 @@ class Reacher:
         # A radian of pitch weighs as much as 0.2 m of position.
         error[3] = 0.2 * (pose.pitch_rad - asin(min(max(float(along[2]), -1.0), 1.0)))
         start = np.array([angles[name] for name in self.joints])
-        free = np.ones(4, dtype=bool)
-        change = np.zeros(4)
-        for _ in range(4):
+        free = np.ones(len(start), dtype=bool)
+        change = np.zeros(len(start))
+        for _ in start:
             part = jac[:, free]
             rest = error - jac[:, ~free] @ change[~free]
             change[free] = part.T @ np.linalg.solve(part @ part.T + self._damping, rest)

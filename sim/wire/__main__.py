@@ -23,14 +23,13 @@ from sim.wire.servo import EmulatedServoBus
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.wire", description="Emulated hardware on pseudo-terminals.")
     parser.add_argument("folder", type=Path, help="folder for the ports")
-    parser.add_argument(
-        "--description", type=Path, metavar="FILE", help="description of a robot other than the Calliope"
-    )
+    parser.add_argument("--robot", type=Path, metavar="NAME|FILE", help="lekiwi, or the file of a robot's description")
+    parser.add_argument("--description", dest="robot", type=Path, help=argparse.SUPPRESS)  # its former spelling
     parser.add_argument("--measured", type=Path, metavar="FILE", help="values that were measured on this robot")
     options = parser.parse_args()
     folder: Path = options.folder
     try:
-        robot = Robot.load(options.description, options.measured)
+        robot = Robot.load(options.robot, options.measured)
         lines = servos_on_lines(robot)
     except ConfigError as error:
         parser.error(str(error))

@@ -139,13 +139,14 @@ def main() -> int:
     parser.add_argument("--sensors", choices=("ideal", "real"), default="real")
     parser.add_argument("--pan", type=float, default=0.0, metavar="DEG")
     parser.add_argument("--tilt", type=float, default=-25.0, metavar="DEG")
-    parser.add_argument("--description", type=Path, metavar="FILE", help="description of the robot, if no Calliope")
+    parser.add_argument("--robot", type=Path, metavar="NAME|FILE", help="lekiwi, or the file of a robot's description")
+    parser.add_argument("--description", dest="robot", type=Path, help=argparse.SUPPRESS)  # its former spelling
     parser.add_argument("--measured", type=Path, metavar="FILE", help="values that were measured on this robot")
     options = parser.parse_args()
     config = SimConfig(scene=options.scene, seed=options.seed, sensors=options.sensors)
     try:
         record(
-            options.folder, Robot.load(options.description, options.measured), config, round(options.seconds * RATE_HZ),
+            options.folder, Robot.load(options.robot, options.measured), config, round(options.seconds * RATE_HZ),
             pan_rad=radians(options.pan), tilt_rad=radians(options.tilt),
         )  # fmt: skip
     except CocoroError as error:
