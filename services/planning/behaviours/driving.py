@@ -75,6 +75,8 @@ class Approaching:
         self._stalls = 0
         self._glance_since_ns: int | None = None
         self._unsure_since_ns: int | None = None
+        self._making_room_from: Pose2 | None = None
+        """Where the robot began to back off to have room for the arm."""
 
     def step(self, snapshot: Snapshot) -> Plan:
         actuators, config = snapshot.actuators, snapshot.actuators.config
@@ -130,6 +132,8 @@ class Approaching:
         may hide it."""
         if target.sigma_m <= snapshot.actuators.config.arm.grasp_sigma_m:
             return False
+        if snapshot.estimator.hidden(self._label, target.position_m, snapshot.angles):
+            return False  # it will not be seen better before the hand is out of the way
         if self._unsure_since_ns is None:
             self._unsure_since_ns = snapshot.now_ns
         return snapshot.now_ns - self._unsure_since_ns < (self.UNSURE_S + 2 * snapshot.estimator.sight_lag_s) * NS
@@ -174,6 +178,20 @@ class Approaching:
             return None
         return snapshot.unseen_under_swing()
 
+    MAKE_ROOM_M = 0.30
+    MAKE_ROOM_MPS = 0.06
+
+    def _make_room(self, snapshot: Snapshot, move: Move, fields: Fields) -> Move:
+        """Back off until the arm has room to unfold: after a failed grip the robot stands at the target already."""
+        assert self._course is not None
+        if self._making_room_from is None:
+            self._making_room_from = snapshot.body
+        back = move._replace(speed_mps=-self.MAKE_ROOM_MPS, turn_radps=0.0, arrived=False, direct=False, look_at=None)
+        gone_m = -self._making_room_from.inverse().compose(snapshot.body).x_m
+        if gone_m > self.MAKE_ROOM_M or self._course.guarded(back, snapshot.body, fields, snapshot.actuators.driver):
+            return _waiting(move, "no room to unfold the arm")._replace(blocked=True)
+        return back._replace(why="backing off, for there is no room to unfold the arm")
+
     def _ready_hand(
         self, snapshot: Snapshot, target: TargetEstimate, move: Move, fields: Fields
     ) -> tuple[ArmStep, Move]:
@@ -199,14 +217,15 @@ class Approaching:
             return arm.park(angles, dt_s), move
         elif not self._room_here(snapshot, fields):
             step = arm.park(angles, dt_s)._replace(arrived=False)
-            if move.arrived:
-                return step, move._replace(arrived=False, blocked=True, why="no room to unfold the arm")
+            if move.arrived or self._making_room_from is not None:
+                return step, self._make_room(snapshot, move, fields)
             return step, move._replace(why=f"no room yet to unfold the arm; {move.why}")
         elif arm.parked(reference) and (place := self._unseen_swing(snapshot)) is not None:
             why = "looking where to unfold the arm"
             # The robot drives on meanwhile, but not up to the target.
             held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
             return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
+        self._making_room_from = None
         if arm.folded(reference) and not self._room_ahead(snapshot, target, fields):
             move = _waiting(move, "unfolding the arm here, where there is room")
         actuators.grip.open()
