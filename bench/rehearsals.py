@@ -2,7 +2,8 @@
 
 Rehearsals run in parallel processes; the share of those that met the set's conditions must be all, or `--least`. Only
 the wall time depends on the machine's load. `python -m bench rehearsals random --latency perception=0.2 --seeds 0:100`
-has perception take 0.2 s longer for each frame.
+has perception take 0.2 s longer for each frame. `paper-scaled` and `random-scaled` are for other robots, one can for
+each seed: `python -m bench rehearsals paper-scaled --description lekiwi --small --frames 320x240@15 --seeds 0:30`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ import argparse
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from importlib import resources
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 from apps.rehearsal.request import RehearsalRequest
@@ -51,8 +55,16 @@ def _paper(seed: int) -> Iterator[dict[str, Any]]:
         yield {"task": FetchTask(label=label)}
 
 
+def _paper_scaled(seed: int) -> Iterator[dict[str, Any]]:
+    yield {"task": FetchTask(label=PAPER[seed % 3]), "scene": "paper-scaled"}
+
+
 def _random(seed: int) -> Iterator[dict[str, Any]]:
     yield {"task": FetchTask(label=random_scene(seed).objects[0].label), "scene": "random"}
+
+
+def _random_scaled(seed: int) -> Iterator[dict[str, Any]]:
+    yield {"task": FetchTask(label=random_scene(seed).objects[0].label), "scene": "random-scaled"}
 
 
 def _follow(seed: int) -> Iterator[dict[str, Any]]:
@@ -71,6 +83,8 @@ def _absent(seed: int) -> Iterator[dict[str, Any]]:
 SETS: dict[str, tuple[Callable[[int], Iterator[dict[str, Any]]], Callable[[Result], bool]]] = {
     "paper": (_paper, _fetched),
     "random": (_random, _no_contact),
+    "paper-scaled": (_paper_scaled, _fetched),
+    "random-scaled": (_random_scaled, _fetched),
     "follow": (_follow, _followed),
     "bring": (_bring, _brought),
     "absent": (_absent, _not_found),
@@ -97,11 +111,23 @@ def _line(request: RehearsalRequest, result: Result) -> str:
     return f"{what:44s} {result['outcome']} {result['reason']} {result['sim_s']:.1f} s {json.dumps(truth)}"
 
 
+def small_objects(file: Path) -> str:
+    """Write the project's known objects to a file with sizes for a smaller hand, cans of 40 x 100 mm and a ball of
+    44 mm; returns its path."""
+    text = resources.files("cocoro").joinpath("objects.toml").read_text(encoding="utf-8")
+    for was, now in (("0.033", "0.020"), ("0.030", "0.022")):
+        text = text.replace(f"\nradius_m = {was}\n", f"\nradius_m = {now}\n")
+    file.write_text(text.replace("\nheight_m = 0.120\n", "\nheight_m = 0.100\n"), encoding="utf-8")
+    return str(file)
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("set", choices=SETS, nargs="?", default="paper")
     parser.add_argument("--seeds", type=span, metavar="FROM:TO", help="of each task (0:10)")
     parser.add_argument("--least", type=number_of, help="rehearsals that must be good (all)")
     parser.add_argument("--sensors", choices=("ideal", "real"), default="real")
+    parser.add_argument("--description", help="a robot's description, or the name of one that the project ships")
+    parser.add_argument("--small", action="store_true", help="cans of 40 x 100 mm, a ball of 44 mm")
     add_frames(parser, "640x480@30")
     parser.add_argument("--lockstep", action="store_true", help="perception and planning as one serial cycle")
     add_latency(parser)
@@ -112,6 +138,10 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     make, good = SETS[chosen.set]
     latency = {name: seconds for each in chosen.latency for name, seconds in each.items()}
     common = {"sensors": chosen.sensors, "lockstep": chosen.lockstep, "latency": latency, **chosen.frames}
+    if chosen.description is not None:
+        common["description"] = chosen.description
+    if chosen.small:
+        common["objects"] = small_objects(Path(mkdtemp()) / "small.toml")
     seeds = sized(chosen, chosen.seeds, range(10), range(1))
     requests = [RehearsalRequest(**common, **what, seed=seed) for seed in seeds for what in make(seed)]
     runs, times, rates = Runs(report), [], []

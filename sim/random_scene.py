@@ -9,7 +9,9 @@ import numpy as np
 
 from cocoro.errors import ConfigError, choice_of
 from cocoro.objects import Catalogue, ObjectSpec
+from cocoro.robot import Robot
 from sim.rooms import draw_room
+from sim.scaled import SCALED, nearer, scale_of
 from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
 from sim.seeds import stream
 
@@ -80,12 +82,16 @@ def room_scene(seed: int, target: str = "", catalogue: Catalogue | None = None, 
     return Scene(name=EMPTY if empty else ROOMS, objects=objects, obstacles=walls, light=light)
 
 
-def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "") -> Scene:
+def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "", robot: Robot | None = None) -> Scene:
     """A random scene for the names `random`, `rooms` and `rooms-empty`, otherwise the scene that `load_scene` finds.
-    `objects` is the robot's file of known objects, '' the project's own. Raises ConfigError."""
+    `paper-scaled` and `random-scaled` are at the distances of the robot's arm. `objects` is the robot's file of known
+    objects, '' the project's own. Raises ConfigError."""
     catalogue = Catalogue.load(Path(objects) if objects else None)
-    if name_or_path == NAME:
-        return random_scene(seed, target, catalogue)
+    if name_or_path in (NAME, NAME + SCALED):
+        scale = 1.0 if name_or_path == NAME else scale_of(robot)
+        return random_scene(seed, target, catalogue, scale=scale)
+    if name_or_path == "paper" + SCALED:
+        return nearer(load_scene("paper", seed, catalogue), scale_of(robot), catalogue)
     if name_or_path in (ROOMS, EMPTY):
         return room_scene(seed, target, catalogue, empty=name_or_path == EMPTY)
     return load_scene(name_or_path, seed, catalogue)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 
-GENERATED = ("random", "rooms", "rooms-empty")
+GENERATED = ("random", "rooms", "rooms-empty", "paper-scaled", "random-scaled")
 """Names of the scenes that `sim.random_scene` makes."""
 
 

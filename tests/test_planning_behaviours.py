@@ -15,6 +15,7 @@ from cocoro.messages.actions import Approach
 from services.planning.behaviours.driving import Approaching
 from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
+from services.planning.course import Move
 
 
 @pytest.fixture
@@ -92,6 +93,27 @@ def test_the_arm_unfolds_before_the_robot_turns_to_where_there_is_no_room_for_it
     snapshot = cast(Any, SimpleNamespace(actuators=core.actuators, body=Pose2()))
     for place, room in (((1.5, -0.1, 0.06), True), ((0.2, 0.5, 0.06), False)):
         assert approaching._room_ahead(snapshot, cast(Any, SimpleNamespace(position_m=place)), cast(Any, None)) is room
+
+
+def test_without_room_for_the_arm_at_the_target_it_backs_off_as_far_as_is_free(planner: Planner) -> None:
+    core = planner.under_test.core
+    assert isinstance(core, PlanningCore)
+    there = Move(0.1, 0.2, 0.0, "there", True, arrived=True)
+
+    def made(backwards_m: float, *, guarded: bool) -> Move:
+        approaching._course = cast(Any, SimpleNamespace(guarded=lambda *_: guarded))
+        snapshot = cast(Any, SimpleNamespace(actuators=core.actuators, body=Pose2(1.0 - backwards_m)))
+        return approaching._make_room(snapshot, there, cast(Any, None))
+
+    approaching = Approaching(Approach(label="red_can"))
+    for backwards_m in (0.0, 0.15, 0.29):
+        move = made(backwards_m, guarded=False)
+        assert (move.speed_mps, move.turn_radps, move.blocked) == (-0.06, 0.0, False)
+        assert not move.arrived
+    assert made(0.31, guarded=False).blocked
+    approaching = Approaching(Approach(label="red_can"))
+    move = made(0.0, guarded=True)
+    assert (move.speed_mps, move.blocked, move.why) == (0.0, True, "no room to unfold the arm")
 
 
 def test_reaching_for_what_is_too_far_is_unreachable(planner: Planner) -> None:

@@ -50,7 +50,6 @@ class PlanningCore:
         self._looks_to: tuple[float, float] | None = None
         """Goal of the neck, where there is one."""
         self._floor_plan = FloorPlanner()
-        self._estimator.hull = self.actuators.arm.clearance.hull
 
         self.learned = Learned(robot, config)
         if config.model:

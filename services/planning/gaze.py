@@ -247,7 +247,7 @@ class BaseAsNeck:
     def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
         (centres, radii), (wide_m, high_m) = hull, half_m
         for up_m in (-high_m, 0.0, high_m):
-            way = np.array(centre_m) + [0.0, 0.0, up_m] - self._place
+            way = np.array([*centre_m[:2], centre_m[2] + up_m]) - self._place
             along = np.clip((centres - self._place) @ way / (way @ way), 0.0, 1.0)
             off_m = np.linalg.norm(centres - self._place - along[:, None] * way, axis=1)
             if (off_m < radii + wide_m).any():

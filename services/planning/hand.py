@@ -11,6 +11,7 @@ from cocoro.robot import Robot
 from services.planning.config import HandConfig
 
 MOST_ROOM_M = 0.015
+"""A jaw that pushes a thing over by more may tip it or push it out of the hand."""
 
 
 def aside_m(robot: Robot, width_m: float, room_m: float) -> float:

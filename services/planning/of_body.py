@@ -23,7 +23,7 @@ _HAND_MARGIN_M = 0.01
 """The hand's half width goes up to the next multiple of this."""
 
 _PAIR = 2
-"""A single jaw presses as hard against the fixed finger as two press on each other, and gives way by as much as both."""
+"""A single jaw goes on as far after the contact as two do together: there is no pair that has to be in balance."""
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 

@@ -37,6 +37,7 @@ from services.planning.floor_map import Solid, inside
 from services.planning.gaze import gaze_of
 from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.own_arm import SEEN_WHOLE, OwnArm
 from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
 from services.planning.seen_floor import SeenFloor
@@ -48,8 +49,6 @@ _WAIT_FOR_ODOMETRY_NS = NS // 5
 _SLOW_S = 0.2
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
-SEEN_WHOLE = 3
-"""Sightings that showed a thing whole, after which its place is known better than by a part of it."""
 _STEADY_RADPS = 1.0
 """A camera that turns faster does not correct the body's pose."""
 _POSTURES = 256
@@ -94,6 +93,7 @@ class StateEstimator:
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
         self._gaze = gaze_of(robot, config.head)
+        self.own_arm = OwnArm(robot, self._gaze, self._known)
         self.seen = SeenFloor(config.search, robot, self._gaze)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
@@ -113,8 +113,6 @@ class StateEstimator:
         self.camera_tilt: CameraTilt | None = None
         """The camera's learned tilt: points that a tilted camera sees above the floor may be floor."""
         self._watched = {config.marker}
-        self.hull: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]] | None = None
-        """The arm's hull for the angles of all joints, rad: centres, (n, 3), body frame, m, and radii, (n,), m."""
         self._sightings: list[PostureSighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
@@ -263,7 +261,7 @@ class StateEstimator:
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         self._localised_ns = detections.stamp_ns
-        solids = []
+        solids, angles = [], self._posture_at(detections.stamp_ns)
         for detection in detections.detections:
             if detection.position_m is None:
                 self.unlocalised[detection.label] = (detections.stamp_ns, detection.note)
@@ -271,7 +269,8 @@ class StateEstimator:
             distance_m = float(np.linalg.norm(detection.position_m))
             place = np.array(body.apply(detection.position_m))
             doubtful = detection.note != ""
-            if self._behind_the_arm(detection, detections.stamp_ns):
+            known = angles is not None and self.memory.whole(detection.label) >= SEEN_WHOLE
+            if known and self.own_arm.hides(detection.label, detection.position_m, angles or {}):
                 continue
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
@@ -281,20 +280,6 @@ class StateEstimator:
                 x, y, z = place.tolist()
                 solids.append(Solid((x, y, z), item.planar_radius_m, item.size_m[2]))
         self._in_frames.append((detections.stamp_ns, tuple(solids)))
-
-    def hidden(self, label: str, place_m: Vec3, angles: Mapping[str, float]) -> bool:
-        """Whether the own arm may hide a part of a thing at a place, body frame, m, for the angles of all joints."""
-        item = self._known.get(label)
-        half_m = (OBJECT_M, OBJECT_M) if item is None else (item.planar_radius_m, item.size_m[2] / 2)
-        return self.hull is not None and self._gaze.hidden(place_m, half_m, self.hull(angles))
-
-    def _behind_the_arm(self, detection: Detection, stamp_ns: int) -> bool:
-        """Whether the own arm may hide a part of a thing that was seen whole before. The middle of the part that is
-        left is not the thing's, even where too little is hidden to be noted."""
-        angles, place_m = self._posture_at(stamp_ns), detection.position_m
-        if angles is None or place_m is None or self.memory.whole(detection.label) < SEEN_WHOLE:
-            return False
-        return self.hidden(detection.label, place_m, angles)
 
     def _keep_sighting(self, detection: Detection, stamp_ns: int) -> None:
         angles = self._posture_at(stamp_ns)

@@ -132,7 +132,7 @@ class Approaching:
         may hide it."""
         if target.sigma_m <= snapshot.actuators.config.arm.grasp_sigma_m:
             return False
-        if snapshot.estimator.hidden(self._label, target.position_m, snapshot.angles):
+        if snapshot.estimator.own_arm.hides(self._label, target.position_m, snapshot.angles):
             return False  # it will not be seen better before the hand is out of the way
         if self._unsure_since_ns is None:
             self._unsure_since_ns = snapshot.now_ns
