@@ -77,6 +77,8 @@ class Grip:
         self._jaws = robot.jaws
         self._roll = robot.arm.roll
         self._goals: dict[str, float] | None = None
+        self._clamped: dict[str, float] | None = None
+        """Goals that clamp an object."""
         self._held_since_ns: int | None = None
 
     def open(self) -> None:
@@ -95,6 +97,7 @@ class Grip:
         self._goals = {
             name: angle - self._config.clamp_rad for name, angle in zip(self._jaws, self.opening(hand), strict=True)
         }
+        self._clamped = self._goals
 
     def halt(self, hand: ServoState) -> None:
         """Stop claws that open or close; those that have met an object clamp it. Claws that clamp already do nothing
@@ -133,11 +136,21 @@ class Grip:
 
     def feel(self, hand: ServoState, now_ns: int) -> None:
         """Take a measurement: a grip counts once it has lasted `settle_s`."""
+        self._press_on(hand)
         if self._pressed(hand) and sum(self.opening(hand)) > len(self._jaws) * (0.06 - self._config.close_rad):
             if self._held_since_ns is None:
                 self._held_since_ns = now_ns
         else:
             self._held_since_ns = None
+
+    def _press_on(self, hand: ServoState) -> None:
+        """Let a single jaw that clamps go on with its thing. It may have stopped at one that still stood off the fixed
+        finger, or that turned in the hand since; of a pair, one jaw that follows would push the other away."""
+        if self._goals is None or self._goals != self._clamped or len(self._jaws) != 1:
+            return
+        (name,), (opening,) = self._jaws, self.opening(hand)
+        goal = max(min(self._goals[name], opening - self._config.clamp_rad), -self._config.close_rad)
+        self._goals = self._clamped = {name: goal}
 
     def holding(self, now_ns: int) -> bool:
         """Whether the claws have held something for `settle_s`."""
