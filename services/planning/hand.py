@@ -156,6 +156,11 @@ class Grip:
         """Whether the claws have held something for `settle_s`."""
         return self._held_since_ns is not None and (now_ns - self._held_since_ns) / 1e9 >= self._config.settle_s
 
+    @property
+    def pressing(self) -> bool:
+        """Whether the claws push against something at the newest measurement."""
+        return self._held_since_ns is not None
+
     def _pressed(self, hand: ServoState) -> bool:
         """Whether all jaws push inwards without closing; two may swing together."""
         loads = dict(zip(hand.joints, hand.load, strict=True))
