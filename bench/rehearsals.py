@@ -2,7 +2,8 @@
 
 Rehearsals run in parallel processes; the share of those that met the set's conditions must be all, or `--least`. Only
 the wall time depends on the machine's load. `python -m bench rehearsals random --latency perception=0.2 --seeds 0:100`
-has perception take 0.2 s longer for each frame.
+has perception take 0.2 s longer for each frame. `paper-scaled` and `random-scaled` are for other robots, one can for
+each seed: `python -m bench rehearsals paper-scaled --robot lekiwi --frames 320x240@15 --seeds 0:30`.
 """
 
 from __future__ import annotations
@@ -51,8 +52,16 @@ def _paper(seed: int) -> Iterator[dict[str, Any]]:
         yield {"task": FetchTask(label=label)}
 
 
+def _paper_scaled(seed: int) -> Iterator[dict[str, Any]]:
+    yield {"task": FetchTask(label=PAPER[seed % 3]), "scene": "paper-scaled"}
+
+
 def _random(seed: int) -> Iterator[dict[str, Any]]:
     yield {"task": FetchTask(label=random_scene(seed).objects[0].label), "scene": "random"}
+
+
+def _random_scaled(seed: int) -> Iterator[dict[str, Any]]:
+    yield {"task": FetchTask(label=random_scene(seed).objects[0].label), "scene": "random-scaled"}
 
 
 def _follow(seed: int) -> Iterator[dict[str, Any]]:
@@ -71,6 +80,8 @@ def _absent(seed: int) -> Iterator[dict[str, Any]]:
 SETS: dict[str, tuple[Callable[[int], Iterator[dict[str, Any]]], Callable[[Result], bool]]] = {
     "paper": (_paper, _fetched),
     "random": (_random, _no_contact),
+    "paper-scaled": (_paper_scaled, _fetched),
+    "random-scaled": (_random_scaled, _fetched),
     "follow": (_follow, _followed),
     "bring": (_bring, _brought),
     "absent": (_absent, _not_found),
@@ -102,6 +113,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=span, metavar="FROM:TO", help="of each task (0:10)")
     parser.add_argument("--least", type=number_of, help="rehearsals that must be good (all)")
     parser.add_argument("--sensors", choices=("ideal", "real"), default="real")
+    parser.add_argument("--robot", help="a robot that the project ships, or the file of its description")
     add_frames(parser, "640x480@30")
     parser.add_argument("--lockstep", action="store_true", help="perception and planning as one serial cycle")
     add_latency(parser)
@@ -112,6 +124,8 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     make, good = SETS[chosen.set]
     latency = {name: seconds for each in chosen.latency for name, seconds in each.items()}
     common = {"sensors": chosen.sensors, "lockstep": chosen.lockstep, "latency": latency, **chosen.frames}
+    if chosen.robot is not None:
+        common["description"] = chosen.robot
     seeds = sized(chosen, chosen.seeds, range(10), range(1))
     requests = [RehearsalRequest(**common, **what, seed=seed) for seed in seeds for what in make(seed)]
     runs, times, rates = Runs(report), [], []

@@ -242,6 +242,15 @@ def is_shipped(file: str | Path) -> bool:
     return str(file) in SHIPPED
 
 
+def base_of(file: str | Path) -> str | None:
+    """The shipped description that a description changes; None where it stands for itself, or cannot be read."""
+    try:
+        base = tomllib.loads(_text(str(file))).get(BASED_ON)
+    except (ValueError, OSError):  # `read` says what is wrong with it
+        return None
+    return base if isinstance(base, str) and is_shipped(base) else None
+
+
 def _text(where: str) -> str:
     if is_shipped(where):
         where = f"{where}.toml"

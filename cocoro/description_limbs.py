@@ -70,11 +70,17 @@ class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pad_thickness_m: Positive
     fixed_pad_m: float | None = None
     """With one jaw: distance of the fixed pad's face from the axis of `arm.tip`, on the side away from the jaw."""
+    open_deg: Positive | None = None
+    """How far a jaw opens to go around a thing; None: as the planner's settings say, which are a Calliope's."""
 
     @property
     def jaw_pad_m(self) -> float:
         """Distance of a moving pad's face from the axis of `arm.tip` at angle 0."""
         return self.pad_gap_m / 2 if self.fixed_pad_m is None else self.pad_gap_m - self.fixed_pad_m
+
+    @property
+    def open_rad(self) -> float | None:
+        return None if self.open_deg is None else radians(self.open_deg)
 
     @property
     def level_roll_rad(self) -> float:

@@ -3,6 +3,8 @@
 ada.toml            the description
 ada-objects.toml    its known objects, in place of the project's own: what its hand takes
 ada-paper.toml      its scene `paper`, in place of the project's; so with the name of every scene
+
+What a description that is based on a shipped one has not beside it is taken from beside that one.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from cocoro.description import is_shipped
+from cocoro.description import base_of, is_shipped
 
 if TYPE_CHECKING:
     from cocoro.robot import Robot
@@ -55,5 +57,5 @@ def _beside(description: str | Path | None, word: str) -> Path | None:
         if description is not None:
             home = Path(str(resources.files("cocoro"))) if is_shipped(description) else Path(description).parent
             file = home / f"{Path(description).stem}-{word}.toml"
-            return file.resolve() if file.is_file() else None
+            return file.resolve() if file.is_file() else _beside(base_of(description), word)
     return None

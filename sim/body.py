@@ -192,6 +192,7 @@ def _jaw(robot: Robot, link: str) -> list[Part]:
     tip = robot.chain(robot.arm.tip).pose(hand)
     to_claw = np.linalg.inv(robot.chain(link).pose(hand))
     reach = float((to_claw @ tip)[1, 3])  # from the claw's axis to the pad, along the roll axis
+    level = round(float((to_claw @ tip)[2, 3]), 9)  # both pads at one height, wherever on its axis a jaw has its frame
     axis = root if claw.fixed_pad_m is None else tip
     offset = -float((to_claw @ axis)[0, 3])  # from the hand's axis to the claw's
     face = claw.jaw_pad_m - offset
@@ -200,9 +201,9 @@ def _jaw(robot: Robot, link: str) -> list[Part]:
     toward = 1.0 if reach > 0 else -1.0
     start = abs(reach) - length / 2
     bracket = middle + thickness / 2 + 0.010, start + 0.010, height
-    place = (middle + thickness / 2 - 0.010) / 2, toward * (start - 0.010) / 2, 0.0
+    place = (middle + thickness / 2 - 0.010) / 2, toward * (start - 0.010) / 2, level
     return [
-        Part(f"{link}_pad", link, "box", (thickness, length, height), (middle, reach, 0.0), _DARK, 0.035),
+        Part(f"{link}_pad", link, "box", (thickness, length, height), (middle, reach, level), _DARK, 0.035),
         Part(f"{link}_bracket", link, "box", bracket, place, _GREY, 0.045),
     ]
 

@@ -105,7 +105,7 @@ def stage_of(robot: Robot, settings: Mapping[str, Any], files: Mapping[str, byte
             config = msgspec.convert({**settings, **paths}, SimConfig)
         except msgspec.ValidationError as error:
             raise ConfigError(f"the simulator's configuration does not fit today's: {error}") from error
-        scene = find_scene(config.scene, config.seed, config.target, config.objects)
+        scene = find_scene(config.scene, config.seed, config.target, config.objects, robot)
     return OutsideStage(body_of(robot, config.body, config.seed, config.bend_at_s).robot, scene)
 
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from cocoro.errors import ConfigError, choice_of
 from cocoro.objects import Catalogue, ObjectSpec
+from cocoro.robot import Robot
 from sim.rooms import draw_room
+from sim.scaled import SCALED, nearer, scale_of
 from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
 from sim.seeds import stream
 
@@ -27,13 +29,13 @@ _BY_ROBOT_M = 0.30
 _TRIES = 2000
 
 
-def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None) -> Scene:
+def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None, *, scale: float = 1.0) -> Scene:
     """Draw a scene: 1 to 4 known objects, 0.8 to 2.0 m away, within 120 degrees to either side and at least 0.25 m
     apart; for half of the seeds also 1 or 2 obstacles beside the lines of sight.
 
     At least one object fits into the hand. `target` is always among them: it takes the place of the first object, so
-    that the places do not depend on the target. `catalogue` holds the known objects; None is the project's own. Raises
-    ConfigError for a target that is no known object.
+    that the places do not depend on the target. `catalogue` holds the known objects; None is the project's own.
+    `scale`: of all distances from the robot. Raises ConfigError for a target that is no known object.
     """
     rng = stream(seed, "random scene")
     catalogue = Catalogue.load() if catalogue is None else catalogue
@@ -48,12 +50,12 @@ def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None
             raise ConfigError(f"scene random: no known object {target!r}; {choice_of(target, catalogue.labels)}")
         if wanted not in chosen:
             chosen[0] = wanted
-    places = _places(rng, len(chosen))
+    places = _places(rng, len(chosen), scale)
     objects = tuple(_object(known, place) for known, place in zip(chosen, places, strict=True))
     count = int(rng.integers(1, 3)) if rng.random() < 0.5 else 0
     obstacles: list[Obstacle] = []
     while len(obstacles) < count:
-        obstacles.append(_obstacle(rng, places, obstacles))
+        obstacles.append(_obstacle(rng, places, obstacles, scale))
     light = Light(ambient=float(rng.uniform(0.45, 0.65)), temperature_k=float(rng.uniform(4500, 6500)))
     return Scene(name=NAME, objects=objects, obstacles=tuple(obstacles), light=light)
 
@@ -80,21 +82,25 @@ def room_scene(seed: int, target: str = "", catalogue: Catalogue | None = None, 
     return Scene(name=EMPTY if empty else ROOMS, objects=objects, obstacles=walls, light=light)
 
 
-def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "") -> Scene:
+def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "", robot: Robot | None = None) -> Scene:
     """A random scene for the names `random`, `rooms` and `rooms-empty`, otherwise the scene that `load_scene` finds.
-    `objects` is the robot's file of known objects, '' the project's own. Raises ConfigError."""
+    `paper-scaled` and `random-scaled` are at the distances of the robot's arm. `objects` is the robot's file of known
+    objects, '' the project's own. Raises ConfigError."""
     catalogue = Catalogue.load(Path(objects) if objects else None)
-    if name_or_path == NAME:
-        return random_scene(seed, target, catalogue)
+    if name_or_path in (NAME, NAME + SCALED):
+        scale = 1.0 if name_or_path == NAME else scale_of(robot)
+        return random_scene(seed, target, catalogue, scale=scale)
+    if name_or_path == "paper" + SCALED:
+        return nearer(load_scene("paper", seed, catalogue), scale_of(robot), catalogue)
     if name_or_path in (ROOMS, EMPTY):
         return room_scene(seed, target, catalogue, empty=name_or_path == EMPTY)
     return load_scene(name_or_path, seed, catalogue)
 
 
-def _places(rng: np.random.Generator, count: int) -> list[tuple[float, float]]:
+def _places(rng: np.random.Generator, count: int, scale: float) -> list[tuple[float, float]]:
     places: list[tuple[float, float]] = []
     while len(places) < count:
-        distance, bearing = rng.uniform(*DISTANCE_M), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
+        distance, bearing = scale * rng.uniform(*DISTANCE_M), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
         place = (distance * cos(bearing), distance * sin(bearing))
         if all(hypot(place[0] - x, place[1] - y) >= APART_M for x, y in places):
             places.append(place)
@@ -114,9 +120,11 @@ def _object(known: ObjectSpec, place: tuple[float, float]) -> SceneObject:
     )
 
 
-def _obstacle(rng: np.random.Generator, objects: list[tuple[float, float]], others: list[Obstacle]) -> Obstacle:
+def _obstacle(
+    rng: np.random.Generator, objects: list[tuple[float, float]], others: list[Obstacle], scale: float
+) -> Obstacle:
     for _ in range(_TRIES):
-        distance, bearing = rng.uniform(0.6, 1.8), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
+        distance, bearing = scale * rng.uniform(0.6, 1.8), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
         x, y = distance * cos(bearing), distance * sin(bearing)
         width, depth, height = (float(v) for v in rng.uniform((0.12, 0.12, 0.20), (0.35, 0.35, 0.60)))
         reach = hypot(width, depth) / 2

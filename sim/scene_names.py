@@ -6,7 +6,7 @@ from importlib import resources
 
 DEFAULT = "paper"
 """The scene where none is named."""
-GENERATED = ("random", "rooms", "rooms-empty")
+GENERATED = ("random", "rooms", "rooms-empty", "paper-scaled", "random-scaled")
 """Names of the scenes that `sim.random_scene` makes."""
 
 

@@ -241,7 +241,7 @@ def make_world(
     """Make the world: the scene with the robot in it."""
     return World(
         _with_timeout(robot, config.command_timeout_s),
-        find_scene(config.scene, config.seed, config.target, config.objects),
+        find_scene(config.scene, config.seed, config.target, config.objects, robot),
         seed=config.seed,
         sensors=config.sensors,
         physics_hz=config.physics_hz,

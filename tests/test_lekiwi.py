@@ -21,10 +21,11 @@ from cocoro.messages import BaseCommand, ServoCommand
 from cocoro.robot import Robot
 from deploy.profiles import read
 from services.planning.clearance import Clearance
-from services.planning.config import ArmConfig, HandConfig, HeadConfig, PlanningConfig, of_body
+from services.planning.config import ArmConfig, HandConfig, HeadConfig, PlanningConfig
 from services.planning.core import PlanningCore
 from services.planning.gaze import BaseAsNeck, gaze_of
 from services.planning.hand import widest_m
+from services.planning.of_body import of_body
 from services.planning.reach import HandPose, Reacher
 from sim.world import World
 
@@ -90,7 +91,7 @@ def test_its_postures_are_what_they_are_for(lekiwi: Robot) -> None:
 
 
 def test_it_reaches_where_its_description_says(lekiwi: Robot) -> None:
-    reacher, clearance, config = Reacher(lekiwi, 0.02), Clearance(lekiwi), of_body(ArmConfig(), lekiwi.reach)
+    reacher, clearance, config = Reacher(lekiwi, 0.02), Clearance(lekiwi), of_body(PlanningConfig(), lekiwi).arm
     for radius_m in (config.retreat_radius_m, *config.grasp_radius_range_m):
         found = reacher.solve(reacher.upright, HandPose(radius_m, 0.0, 0.05, config.pitch_rad))
         assert found is not None
@@ -110,7 +111,7 @@ def test_what_a_profile_sets_counts_before_the_descriptions_reach(lekiwi: Robot,
 
 
 def test_the_open_hand_takes_what_fits_between_its_pads(lekiwi: Robot, robot: Robot) -> None:
-    assert 0.045 < widest_m(lekiwi, HandConfig()) < 0.06
+    assert widest_m(lekiwi, of_body(PlanningConfig(), lekiwi).hand) == pytest.approx(0.064, abs=0.001)
     assert widest_m(robot, HandConfig()) == pytest.approx(0.072 + 2 * 0.0686 * np.sin(0.42), abs=0.001)
 
 

@@ -115,3 +115,27 @@ def test_one_jaw_that_is_stopped_holds_something(tmp_path: Path) -> None:
 def test_a_contradiction_is_named(text: str, error: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=error):
         Robot.load(Path(written(tmp_path, text)))
+
+
+def test_a_single_jaw_that_clamps_goes_on_with_what_moves_on_and_a_pair_stays(tmp_path: Path, robot: Robot) -> None:
+    config = HandConfig()
+    for body, follows in ((one_jaw(tmp_path), True), (robot, False)):
+        grip, signs = Grip(body, config), body.claw.open_sign
+
+        def goals(opening_rad: float, grip: Grip = grip, signs: dict[str, float] = signs) -> set[float]:
+            hand = ServoState(
+                joints=tuple(signs), position_rad=tuple(sign * opening_rad for sign in signs.values()),
+                speed_radps=(0.0,) * len(signs), load=tuple(-0.3 * sign for sign in signs.values()),
+            )  # fmt: skip
+            if grip.command(None).joints == ():
+                grip.clamp(hand)
+            grip.feel(hand, 10**9)
+            command = grip.command(None)
+            return {round(signs[name] * goal, 6) for name, goal in zip(command.joints, command.goal_rad, strict=True)}
+
+        assert goals(0.1) == {round(0.1 - config.clamp_rad, 6)}
+        assert goals(0.02) == {round(0.02 - config.clamp_rad, 6) if follows else round(0.1 - config.clamp_rad, 6)}
+        assert goals(0.05) == {round(0.02 - config.clamp_rad, 6) if follows else round(0.1 - config.clamp_rad, 6)}
+        assert not follows or goals(-0.29) == {-config.close_rad}
+        grip.open()
+        assert goals(-0.29) == {config.open_rad}

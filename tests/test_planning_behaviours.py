@@ -11,6 +11,7 @@ from planner_rig import ROBOT, Planner, standing, started
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro import topics
 from cocoro.frames import Pose2
+from cocoro.messages import PlannerStatus
 from cocoro.messages.actions import Approach
 from services.planning.behaviours.driving import Approaching
 from services.planning.config import PlanningConfig
@@ -130,6 +131,25 @@ def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Pla
     goals = dict(zip(hand.joints, hand.goal_rad, strict=True))
     for claw, sign in ROBOT.claw.open_sign.items():
         assert sign * goals[claw] == pytest.approx(0.05 - config.clamp_rad, abs=0.01)
+
+
+def test_what_settles_between_the_claws_as_it_is_lifted_is_no_slip(planner: Planner) -> None:
+    stopped = {claw: sign * 0.05 for claw, sign in ROBOT.claw.open_sign.items()}
+
+    def run(seconds: float, load: float) -> PlannerStatus:
+        for _ in range(round(seconds / 0.02)):
+            planner.angles |= stopped
+            planner.hand_load = load
+            status = planner.tick()
+        return status
+
+    planner.want("grasp")
+    assert run(0.8, 0.5).state == "done"
+    planner.want("lift")
+    run(0.04, 0.5)
+    run(0.12, 0.0)
+    assert run(0.24, 0.5).state == "running", "loose for longer than a slip, but pressed again"
+    assert run(0.4, 0.0).reason == "slipped"
 
 
 def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Planner) -> None:

@@ -218,3 +218,16 @@ def test_a_slow_perception_takes_no_velocity_from_what_moves() -> None:
     late = memory.estimate("ball", Pose2(), round(30.0 * NS))
     assert late is not None
     assert late.odometry_position_m[0] == pytest.approx(0.25 * (9.5 + 1.0 + 0.8), abs=0.02)
+
+
+def test_a_part_of_a_thing_that_was_seen_whole_is_nothing_else() -> None:
+    memory = TargetMemory(MemoryConfig())
+    end_s = feed(memory, [CAN] * 10)
+    end_s = feed(memory, [CAN] * 6, end_s + FRAME_S, doubtful=True, label="ball")
+    assert memory.sightings("can") == 10
+    assert memory.sightings("ball") == 0
+    end_s = feed(memory, [CAN + np.array([0.3, 0.0, 0.0])] * 6, end_s + FRAME_S, doubtful=True, label="ball")
+    assert memory.sightings("ball") == 6
+    feed(memory, [CAN] * 4, end_s + FRAME_S, label="other")
+    assert memory.sightings("can") == 0, "seen whole, it is the other one"
+    assert (memory.whole("other"), memory.whole("ball"), memory.whole("can")) == (4, 0, 0)

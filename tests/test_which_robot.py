@@ -140,6 +140,20 @@ def test_the_lekiwis_own_things_fit_into_its_hand_and_are_as_its_scenes_have_the
     assert objects_beside(None) is None
 
 
+def test_a_description_has_what_lies_beside_the_one_that_it_is_based_on(tmp_path: Path) -> None:
+    assert objects_beside("lekiwi-colour") == objects_beside("lekiwi")
+    mine = tmp_path / "mine.toml"
+    mine.write_text('based_on = "lekiwi"\nname = "mine"\n')
+    assert (objects_beside(mine), scene_beside(mine, "paper")) == (
+        objects_beside("lekiwi"),
+        scene_beside("lekiwi", "paper"),
+    )
+    (tmp_path / "mine-objects.toml").write_text("")
+    assert objects_beside(mine) == tmp_path / "mine-objects.toml"
+    mine.write_text("based_on = 7")
+    assert scene_beside(mine, "paper") is None
+
+
 def test_the_former_spelling_is_taken_and_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
     former = {"--description": "--robot"}
     assert _renamed(["a", "--description", "x", "--description=y", "--", "--description"], former) == [

@@ -76,7 +76,9 @@ class _Rehearsal:
         self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
         self._task: Task = request.task
         """The task that runs now."""
-        self._scene = find_scene(request.scene, request.seed, self._wanted(self._task), request.objects or "")
+        self._scene = find_scene(
+            request.scene, request.seed, self._wanted(self._task), request.objects or "", self._robot
+        )
         self._judge = self._judge_of(self._task)
         self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, self._present(self._task))

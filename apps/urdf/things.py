@@ -7,8 +7,9 @@ from math import cos, radians, sin
 
 from cocoro.objects import own_text
 from cocoro.robot import Robot
-from services.planning.config import ArmConfig, HandConfig, of_body
+from services.planning.config import ArmConfig, PlanningConfig
 from services.planning.hand import widest_m
+from services.planning.of_body import of_body
 
 CAN_M, HIGH_M, BALL_M = 0.033, 0.120, 0.030
 """The project's cans, radius and height, and its ball."""
@@ -34,7 +35,7 @@ def can_m(robot: Robot) -> tuple[float, float]:
 def _opening_m(robot: Robot) -> float:
     """Width of what the open hand goes around, m. The gap of a pair of jaws is assumed, and fingers are thick: it does
     not count."""
-    wide_m = widest_m(robot, HandConfig())
+    wide_m = widest_m(robot, of_body(PlanningConfig(), robot).hand)
     return wide_m if robot.claw.fixed_pad_m is not None else wide_m - robot.claw.pad_gap_m
 
 
@@ -54,7 +55,7 @@ def scene_texts(name: str, robot: Robot) -> Iterator[tuple[str, str]]:
     """Names of its own scenes, and what is in their files."""
     radius_m, height_m = can_m(robot)
     can = f'shape = "cylinder"\nradius_m = {radius_m}\nheight_m = {height_m}\n'
-    reach = of_body(ArmConfig(), robot.reach)
+    reach = of_body(PlanningConfig(), robot).arm
     scale = min(max(reach.grasp_radius_m / ArmConfig().grasp_radius_m, _SCALES[0]), _SCALES[1])
     yield "paper", _scene(
         "paper", f"The scene `paper` of {name}: the paper's directions, {scale:.2f} times its distances.",

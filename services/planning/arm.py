@@ -31,6 +31,8 @@ _KEPT_S = 2.0
 """Longest silence after which the arm is still on its way: a service that died takes longer to come back."""
 _SETTLED_RAD = 0.1
 """On a slow link the arm has arrived when its joints are so near to their goals. (They sag by less.)"""
+_OUT_M = 0.02
+"""So far out the hand goes at once where it cannot rise."""
 _ASTRAY_RAD = 0.6
 """A pitch error above this occurs only after babbling."""
 
@@ -132,7 +134,11 @@ class ArmController:
                     self._config.travel_height_m,
                     pose.pitch_rad,
                 )
-                return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
+                step = self._cartesian(rise, self._config.hand_speed_mps, dt_s)
+                if step.blocked:  # near the chassis the way up bends inwards
+                    outwards = pose._replace(radius_m=pose.radius_m + _OUT_M)
+                    step = self._cartesian(outwards, self._config.hand_speed_mps, dt_s)
+                return step._replace(arrived=False)
             if not out or abs(reference[self._roll] - self._roll_rad) > _NEAR_RAD:
                 return self._joints(self._out | {self._roll: self._roll_rad}, dt_s)._replace(arrived=False)
             return self._joints(self._out | {self._azimuth: self._park[self._azimuth]}, dt_s)._replace(arrived=False)

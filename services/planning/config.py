@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.description_limbs import Reach
 from cocoro.units import Positive
 
 
@@ -164,15 +163,6 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Longest wait: a link that lost a packet has repeated it by then."""
 
 
-def of_body(config: ArmConfig, reach: Reach | None) -> ArmConfig:
-    """The settings with what the robot's description says of its reach, where they are the planner's own."""
-    if reach is None:
-        return config
-    own, told = ArmConfig(), msgspec.structs.asdict(reach)
-    left = {name: value for name, value in told.items() if getattr(config, name) == getattr(own, name)}
-    return msgspec.structs.replace(config, **left)
-
-
 class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     open_rad: Positive = 0.42
     close_rad: Positive = 0.30
@@ -183,7 +173,7 @@ class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grip_load: Positive = 0.25
     """Closing load, as a share of the stall torque, at which a stopped claw counts as holding something."""
     fixed_finger_room_m: Positive = 0.010
-    """With one jaw: what the fixed finger leaves between itself and the target as the hand closes in."""
+    """With one jaw: what the fixed finger leaves at least between itself and the target as the hand closes in."""
     settle_s: Positive = 0.25
     give_up_s: Positive = 2.0
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from msgspec.structs import replace
 
 from cocoro import topics
 from cocoro.arrays import FloatArray
@@ -20,9 +19,10 @@ from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import ArmStep
 from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
-from services.planning.config import PlanningConfig, of_body
+from services.planning.config import PlanningConfig
 from services.planning.floor_plan import FloorPlanner
 from services.planning.learned import Learned
+from services.planning.of_body import of_body
 from services.planning.state_estimator import StateEstimator
 from services.planning.without_depth import of_sight
 
@@ -37,7 +37,7 @@ class PlanningCore:
     """Motion advances by at most this much time in one step."""
 
     def __init__(self, robot: Robot, config: PlanningConfig) -> None:
-        config = of_sight(replace(config, arm=of_body(config.arm, robot.reach)), robot)
+        config = of_sight(of_body(config, robot), robot)
         self._config = config
         self._estimator = StateEstimator(
             config, robot, Catalogue.load(Path(config.objects) if config.objects else None)

@@ -89,6 +89,10 @@ class Gaze(Protocol):
         """Mark the places on the floor, by bearing, rad, and distance, m, each (n,), body frame, that it cannot see
         from here; returns shape (n,)."""
 
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
+        """Whether the robot's own arm may hide a part of a thing, body frame, m, with this half of its width and of its
+        height. `hull`: centres, (n, 3), body frame, m, and radii, (n,), m."""
+
     def reached(self, aim: Direction, here: Here) -> bool:
         """Whether the camera rests at a direction."""
 
@@ -168,6 +172,9 @@ class Neck:
         low, high = self.limits_rad[0]
         return behind_mount(self._robot, np.clip(bearing_rad, low, high), bearing_rad, distance_m)
 
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
+        return False  # a neck stands beside the arm and looks past it
+
     def reached(self, aim: Direction, here: Here) -> bool:
         pan, tilt = self.on_body(here.angles)
         return abs(aim[0] - pan) <= _THERE_RAD and abs(aim[1] - tilt) <= _THERE_RAD
@@ -199,6 +206,7 @@ class BaseAsNeck:
         pose = robot.camera_chain.pose({})
         self._into_camera = np.linalg.inv(pose)
         x, y, self._up_m = pose[:3, 3].tolist()
+        self._place = pose[:3, 3]
         along = pose[:3, 2]
         self._on_body = atan2(along[1], along[0]), asin(min(max(float(along[2]), -1.0), 1.0))
         self._ahead_m = x * cos(self._on_body[0]) + y * sin(self._on_body[0])
@@ -235,6 +243,16 @@ class BaseAsNeck:
         ahead = np.full(len(bearing_rad), self._on_body[0])  # it turns there together with its mount
         beyond = (distance_m < self.nearest_m) | (distance_m > self.farthest_m)
         return np.asarray(beyond | behind_mount(self._robot, ahead, ahead, distance_m))
+
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
+        (centres, radii), (wide_m, high_m) = hull, half_m
+        for up_m in (-high_m, 0.0, high_m):
+            way = np.array([*centre_m[:2], centre_m[2] + up_m]) - self._place
+            along = np.clip((centres - self._place) @ way / (way @ way), 0.0, 1.0)
+            off_m = np.linalg.norm(centres - self._place - along[:, None] * way, axis=1)
+            if (off_m < radii + wide_m).any():
+                return True
+        return False
 
     def reached(self, aim: Direction, here: Here) -> bool:
         pan, _ = self.direction(here.angles, here.body)

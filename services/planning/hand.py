@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from math import sin
+from math import cos, sin
 
 import numpy as np
 
 from cocoro.messages import ServoCommand, ServoState
 from cocoro.robot import Robot
 from services.planning.config import HandConfig
+
+MOST_ROOM_M = 0.015
+"""A jaw that pushes a thing over by more may tip it or push it out of the hand."""
 
 
 def aside_m(robot: Robot, width_m: float, room_m: float) -> float:
@@ -24,15 +27,40 @@ def aside_m(robot: Robot, width_m: float, room_m: float) -> float:
     return float((robot.claw.fixed_pad_m - width_m / 2 - room_m) * (jaw[:3, 0] @ left))
 
 
+def gap_m(robot: Robot, opening_rad: float) -> float:
+    """Distance of the pads' middles, m, with every jaw opened so far."""
+    return robot.claw.pad_gap_m + sum(_levers_m(robot)) * sin(opening_rad)
+
+
+def finger_m(robot: Robot, opening_rad: float) -> float:
+    """Distance, m, of the outer side of an open jaw's end from the hand's middle: the axis between two jaws, or the
+    middle of a thing as wide as `claw.pad_gap_m` that touches the fixed finger."""
+    claw, lever_m = robot.claw, max(_levers_m(robot))
+    out_m = (lever_m + claw.pad_length_m / 2) * sin(opening_rad) + claw.pad_thickness_m * cos(opening_rad)
+    return claw.pad_gap_m / 2 + out_m
+
+
+def _levers_m(robot: Robot) -> list[float]:
+    """For each jaw the distance, m, along the hand from the axis that it turns about to the pads' middle."""
+    zero = dict.fromkeys(robot.joints, 0.0)
+    tip = robot.chain(robot.arm.tip).pose(zero)
+    return [abs(float((np.linalg.inv(robot.chain(robot.link_of(jaw)).pose(zero)) @ tip)[1, 3])) for jaw in robot.jaws]
+
+
+def side_room_m(robot: Robot, config: HandConfig, width_m: float) -> float:
+    """What a fixed finger leaves, m, between itself and a thing of this width as the hand closes in: as much as the
+    open jaw leaves on the other side, but the jaw does not push the thing further than `MOST_ROOM_M`. 0 with two
+    jaws."""
+    if robot.claw.fixed_pad_m is None:
+        return 0.0
+    half_m = (gap_m(robot, config.open_rad) - width_m) / 2
+    return max(min(half_m, MOST_ROOM_M), config.fixed_finger_room_m)
+
+
 def widest_m(robot: Robot, config: HandConfig) -> float:
     """Greatest width, m, of a thing that the open hand goes around, the room beside a fixed finger taken off."""
-    zero, claw = dict.fromkeys(robot.joints, 0.0), robot.claw
-    tip = robot.chain(robot.arm.tip).pose(zero)
-    width_m = claw.pad_gap_m
-    for jaw in robot.jaws:
-        pad = np.linalg.inv(robot.chain(robot.link_of(jaw)).pose(zero)) @ tip
-        width_m += abs(float(pad[1, 3])) * sin(config.open_rad)
-    return width_m if claw.fixed_pad_m is None else width_m - config.fixed_finger_room_m
+    width_m = gap_m(robot, config.open_rad)
+    return width_m if robot.claw.fixed_pad_m is None else width_m - config.fixed_finger_room_m
 
 
 class Grip:
@@ -49,6 +77,8 @@ class Grip:
         self._jaws = robot.jaws
         self._roll = robot.arm.roll
         self._goals: dict[str, float] | None = None
+        self._clamped: dict[str, float] | None = None
+        """Goals that clamp an object."""
         self._held_since_ns: int | None = None
 
     def open(self) -> None:
@@ -67,6 +97,7 @@ class Grip:
         self._goals = {
             name: angle - self._config.clamp_rad for name, angle in zip(self._jaws, self.opening(hand), strict=True)
         }
+        self._clamped = self._goals
 
     def halt(self, hand: ServoState) -> None:
         """Stop claws that open or close; those that have met an object clamp it. Claws that clamp already do nothing
@@ -105,15 +136,30 @@ class Grip:
 
     def feel(self, hand: ServoState, now_ns: int) -> None:
         """Take a measurement: a grip counts once it has lasted `settle_s`."""
+        self._press_on(hand)
         if self._pressed(hand) and sum(self.opening(hand)) > len(self._jaws) * (0.06 - self._config.close_rad):
             if self._held_since_ns is None:
                 self._held_since_ns = now_ns
         else:
             self._held_since_ns = None
 
+    def _press_on(self, hand: ServoState) -> None:
+        """Let a single jaw that clamps go on with its thing. It may have stopped at one that still stood off the fixed
+        finger, or that turned in the hand since; of a pair, one jaw that follows would push the other away."""
+        if self._goals is None or self._goals != self._clamped or len(self._jaws) != 1:
+            return
+        (name,), (opening,) = self._jaws, self.opening(hand)
+        goal = max(min(self._goals[name], opening - self._config.clamp_rad), -self._config.close_rad)
+        self._goals = self._clamped = {name: goal}
+
     def holding(self, now_ns: int) -> bool:
         """Whether the claws have held something for `settle_s`."""
         return self._held_since_ns is not None and (now_ns - self._held_since_ns) / 1e9 >= self._config.settle_s
+
+    @property
+    def pressing(self) -> bool:
+        """Whether the claws push against something at the newest measurement."""
+        return self._held_since_ns is not None
 
     def _pressed(self, hand: ServoState) -> bool:
         """Whether all jaws push inwards without closing; two may swing together."""

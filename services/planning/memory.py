@@ -36,6 +36,8 @@ class Track:
     velocity_mps: FloatArray = field(default_factory=lambda: np.zeros(3))
     covariance: FloatArray = field(default_factory=lambda: np.diag([1e-4, 1e-2]))
     sightings: int = 1
+    whole: int = 0
+    """How many of them showed it whole."""
     surprise: float = 1.0
     """Smoothed normalised innovation; above 1 the object moves more than expected."""
     outliers: list[FloatArray] = field(default_factory=list)
@@ -85,9 +87,12 @@ class TargetMemory:
         if doubtful:
             sigma_m *= config.doubtful_factor
         track = self._tracks.get(label)
+        if doubtful and self._of_another(label, position_m):
+            return
         if track is None or (stamp_ns - track.stamp_ns) / NS > config.forget_s:
-            self._tracks[label] = Track(position_m.copy(), stamp_ns, sigma_m, body=body or Pose2())
-            self._tracks[label].common_m = sigma_m if own_sigma_m is not None else 0.0
+            track = Track(position_m.copy(), stamp_ns, sigma_m, whole=not doubtful, body=body or Pose2())
+            track.common_m = sigma_m if own_sigma_m is not None else 0.0
+            self._tracks[label] = track
             return
         body = body or track.body
         dt_s = (stamp_ns - track.stamp_ns) / NS
@@ -109,8 +114,19 @@ class TargetMemory:
         track.body = body
         track.stamp_ns = stamp_ns
         track.sightings += 1
+        track.whole += not doubtful
         if track.sightings >= _SURE:
             self._forget_mistaken(label, track)
+
+    def _of_another(self, label: str, position_m: FloatArray) -> bool:
+        """Whether a sighting (3,), odometry frame, m, that showed an object in part may show part of another one: one
+        that stands there, and that more sightings showed whole. A can that the hand half hides looks like a ball."""
+        track = self._tracks.get(label)
+        own = track.whole if track is not None else 0
+        return any(
+            other != label and was.whole > own and np.abs(was.position_m - position_m).max() < _ONE_PLACE_M
+            for other, was in self._tracks.items()
+        )
 
     def _forget_mistaken(self, label: str, track: Track) -> None:
         """Forget what was seen in an object's place before under another label: from far or in part, a can may look
@@ -222,6 +238,11 @@ class TargetMemory:
         """Number of sightings that support the object's position."""
         track = self._tracks.get(label)
         return track.sightings if track else 0
+
+    def whole(self, label: str) -> int:
+        """Number of the sightings that showed an object whole."""
+        track = self._tracks.get(label)
+        return track.whole if track else 0
 
     def all(self, body: Pose2, now_ns: int, *, sure: bool = False) -> tuple[TargetEstimate, ...]:
         """The estimates of all objects; `sure`: only of those that were seen repeatedly, since one sighting may be a

@@ -37,6 +37,7 @@ from services.planning.floor_map import Solid, inside
 from services.planning.gaze import gaze_of
 from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.own_arm import SEEN_WHOLE, OwnArm
 from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
 from services.planning.posture_history import PostureHistory
@@ -94,6 +95,7 @@ class StateEstimator:
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
         self._gaze = gaze_of(robot, config.head)
+        self.own_arm = OwnArm(robot, self._gaze, self._known)
         self.seen = SeenFloor(config.search, robot, self._gaze)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
@@ -252,7 +254,7 @@ class StateEstimator:
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         self._localised_ns = detections.stamp_ns
-        solids = []
+        solids, angles = [], self._postures.at(detections.stamp_ns)
         for detection in detections.detections:
             if detection.position_m is None:
                 self.unlocalised[detection.label] = (detections.stamp_ns, detection.note)
@@ -260,6 +262,9 @@ class StateEstimator:
             distance_m = float(np.linalg.norm(detection.position_m))
             place = np.array(body.apply(detection.position_m))
             doubtful = detection.note != ""
+            known = angles is not None and self.memory.whole(detection.label) >= SEEN_WHOLE
+            if known and self.own_arm.hides(detection.label, detection.position_m, angles or {}):
+                continue
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
             self.memory.see(

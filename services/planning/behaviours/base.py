@@ -19,7 +19,7 @@ from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import FloorMap
 from services.planning.gaze import Gaze, gaze_of
-from services.planning.hand import Grip, aside_m, widest_m
+from services.planning.hand import Grip, aside_m, side_room_m, widest_m
 from services.planning.head import Aim, CameraTilt
 from services.planning.navigation import GENTLE, Driver
 from services.planning.reach import HandPose, Reacher
@@ -183,8 +183,8 @@ class Snapshot:
 
     def aside_m(self, label: str) -> float:
         """How far to the left of a target's centre, m, the hand's axis goes to grasp it."""
-        room_m = self.actuators.config.hand.fixed_finger_room_m
-        return aside_m(self.actuators.robot, self.estimator.width_m(label), room_m)
+        robot, width_m = self.actuators.robot, self.estimator.width_m(label)
+        return aside_m(robot, width_m, side_room_m(robot, self.actuators.config.hand, width_m))
 
     def too_wide(self, label: str) -> str:
         """The reason for which the open hand does not go around a target; '' when it does."""

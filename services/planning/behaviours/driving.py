@@ -130,6 +130,8 @@ class Approaching:
         may hide it."""
         if target.sigma_m <= snapshot.actuators.config.arm.grasp_sigma_m:
             return False
+        if snapshot.estimator.own_arm.hides(self._label, target.position_m, snapshot.angles):
+            return False  # it will not be seen better before the hand is out of the way
         if self._unsure_since_ns is None:
             self._unsure_since_ns = snapshot.now_ns
         return snapshot.now_ns - self._unsure_since_ns < (self.UNSURE_S + 2 * snapshot.estimator.sight_lag_s) * NS

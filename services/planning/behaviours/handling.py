@@ -123,7 +123,8 @@ class Lifting:
             self._loose_since_ns = None
         elif self._loose_since_ns is None:
             self._loose_since_ns = snapshot.now_ns
-        elif (snapshot.now_ns - self._loose_since_ns) / 1e9 > self.SLIP_S:
+        elif (snapshot.now_ns - self._loose_since_ns) / 1e9 > self.SLIP_S and not actuators.grip.pressing:
+            # A thing that settles between the claws as it leaves the floor is pressed again, and soon held.
             plan.state, plan.reason, plan.why = "failed", "slipped", "the claws hold nothing any more"
             return plan
         if arm.blocked:
