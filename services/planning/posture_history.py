@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from cocoro.clock import NS
 from cocoro.history import History
 from cocoro.messages import ServoState
@@ -13,8 +15,9 @@ _JUST_NS = NS // 25
 
 
 class PostureHistory:
-    def __init__(self, gap_ns: int) -> None:
-        """`gap_ns`: longest gap over which angles are interpolated."""
+    def __init__(self, joints: Collection[str], gap_ns: int) -> None:
+        """`joints`: all that the robot has. `gap_ns`: longest gap over which angles are interpolated."""
+        self._joints = frozenset(joints)
         self._gap_ns = gap_ns
         self._networks: dict[str, tuple[tuple[str, ...], History]] = {}
 
@@ -41,13 +44,8 @@ class PostureHistory:
 
     def at(self, stamp_ns: int) -> dict[str, float] | None:
         """Every joint's angle, rad, at a time; None where that time is not in the history."""
-        angles: dict[str, float] = {}
-        for joints, history in self._networks.values():
-            then = history.at(stamp_ns, self._gap_ns)
-            if then is None:
-                return None
-            angles.update(zip(joints, then.tolist(), strict=True))
-        return angles
+        angles = self.near(stamp_ns)
+        return angles if angles.keys() >= self._joints else None
 
     def known(self, stamp_ns: int) -> bool:
         """Whether it is known how all were at a time, or just before it."""

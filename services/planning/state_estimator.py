@@ -91,7 +91,7 @@ class StateEstimator:
         self.unlocalised: dict[str, tuple[int, str]] = {}
         """By label, the stamp and note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
-        self._postures = PostureHistory(round(config.odometry_gap_s * NS))
+        self._postures = PostureHistory(robot.joints, round(config.odometry_gap_s * NS))
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
         self._gaze = gaze_of(robot, config.head)
@@ -262,8 +262,11 @@ class StateEstimator:
             distance_m = float(np.linalg.norm(detection.position_m))
             place = np.array(body.apply(detection.position_m))
             doubtful = detection.note != ""
-            known = angles is not None and self.memory.whole(detection.label) >= SEEN_WHOLE
-            if known and self.own_arm.hides(detection.label, detection.position_m, angles or {}):
+            if (
+                angles is not None
+                and self.memory.whole(detection.label) >= SEEN_WHOLE
+                and self.own_arm.hides(detection.label, detection.position_m, angles)
+            ):
                 continue
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
