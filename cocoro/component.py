@@ -95,6 +95,9 @@ class Component:
     rss_mb: float = 150.0
     """Budget of resident memory."""
 
+    imports_later: tuple[str, ...] = ()
+    """Modules that its process imports soon after its start. Without, the first that needs one would import it in the
+    middle of its work, and the process would stand still meanwhile."""
     libraries: tuple[str, ...] = ()
     """Distributions that it needs beside those of the mesh; `cocoro doctor` looks for them."""
     checks: str = ""

@@ -15,8 +15,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from contextlib import suppress
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,8 @@ from deploy.rundir import RunDir
 OK, CRASHED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
 ORPHAN_S = 5.0
 """Time within which a process ends after its supervisor has died."""
+SETTLED_S = 3.0
+"""So long after the start of a process those that were started with it have started, too."""
 LEVEL = "COCORO_LOG"
 """Environment variable with the log level; info when it is not set."""
 
@@ -174,6 +178,8 @@ async def _main(
             log.info("joined the mesh at %s", bus.where)
             if beat_fd is not None:
                 node.spawn(beat(beat_fd))
+            if row.imports_later:
+                node.spawn(_import_later(row.imports_later))
             if await _until(stop, component.run(node, config)):
                 log.info("ended by a signal")
                 return OK
@@ -186,6 +192,15 @@ async def _main(
 
 def _path(file: str | None) -> Path | None:
     return None if file is None else Path(file)
+
+
+async def _import_later(modules: Sequence[str]) -> None:
+    """When the robot's other processes have started, and in a thread, so that this one goes on."""
+    from cocoro.bus.session import in_thread
+
+    await asyncio.sleep(SETTLED_S)
+    for module in modules:
+        await in_thread(partial(import_module, module))
 
 
 def _stop_signal() -> asyncio.Event:

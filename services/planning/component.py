@@ -30,5 +30,6 @@ PLANNING = Component(
     needs=("base", "arm", "hand", "perception"),
     cpu_share=0.4,
     rss_mb=200.0,
+    imports_later=("scipy.sparse.csgraph",),  # the first detour: 0.2 s, in which the base's command would expire
     libraries=("numpy", "scipy", "opencv-python-headless"),
 )
