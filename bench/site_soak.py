@@ -1,13 +1,16 @@
 """Fetches back to back over three hosts for a long time: `python -m bench site-soak --minutes 60`.
 
 Memory and open files of every process on the robot's host and on the brain's are looked at every few seconds. After the
-first minutes none may grow by more than a twentieth; when all is down nothing may be left in shared memory.
+first minutes the own memory of none may grow by more than a twentieth; when all is down nothing may be left in shared
+memory. Frames in shared memory are counted apart: their pool has a fixed size, of which a process has as much resident
+as it has touched so far.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import tempfile
 import threading
 import time
@@ -26,13 +29,16 @@ LOOK_S = 5.0
 SETTLED_SHARE = 1 / 12
 """The first part of the run, in which memory may grow: 5 minutes of an hour."""
 GROWTH = 1.05
+_RESIDENT = re.compile(r"^Rss(Anon|File|Shmem):\s+(\d+) kB$", re.MULTILINE)
 
 
 class Look(NamedTuple):
     """One process at one time."""
 
     at_s: float
-    rss_mb: float
+    own_mb: float
+    """Resident, without shared memory."""
+    shared_mb: float
     files: int
 
 
@@ -59,12 +65,14 @@ class Watch:
 
     def _look(self, name: str, pid: int) -> None:
         try:
-            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            status = Path(f"/proc/{pid}/status").read_text()
             files = len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208 # only their number
-        except (OSError, IndexError):
+        except OSError:
             return
-        rss_mb = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-        self.looks[name].append(Look(time.monotonic() - self._begun_s, rss_mb, files))
+        resident = {kind: int(kib) * 1024 / 1e6 for kind, kib in _RESIDENT.findall(status)}
+        if resident:  # else it has just ended
+            own_mb = resident["Anon"] + resident["File"]
+            self.looks[name].append(Look(time.monotonic() - self._begun_s, own_mb, resident["Shmem"], files))
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -103,12 +111,13 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
             continue
         part = max(1, len(after) // 4)
         first, last = after[:part], after[-part:]
-        grown[process] = max(look.rss_mb for look in last) / max(look.rss_mb for look in first)
+        grown[process] = max(look.own_mb for look in last) / max(look.own_mb for look in first)
         files = max(look.files for look in last) - max(look.files for look in first)
-        course = ", ".join(f"{looks[at * (len(looks) - 1) // 8].rss_mb:.0f}" for at in range(9))
-        report.say(f"{process}: {course} MB, x {grown[process]:.3f}; {last[-1].files} files, {files:+d}")
+        course = ", ".join(f"{looks[at * (len(looks) - 1) // 8].own_mb:.0f}" for at in range(9))
+        shared = f"{first[0].shared_mb:.0f} to {last[-1].shared_mb:.0f} MB of shared memory"
+        report.say(f"{process}: {course} MB, x {grown[process]:.3f}; {shared}; {last[-1].files} files, {files:+d}")
         report.value(f"open files more at the end, {process.split()[0]}", [files], "", at_most=2)
-    worst = "memory at the end / after the first twelfth, the worst process"
+    worst = "own memory at the end / after the first twelfth, the worst process"
     report.value(worst, [max(grown.values())], "x", at_most=GROWTH)
     report.value("left in shared memory", [len(left)], "", at_most=0)
     runs.share("fetched and put down")
