@@ -25,8 +25,8 @@ COMMON = {"camera"}
 
 
 def renamed() -> str:
-    """The Calliope's description with other names for all links and joints."""
-    return re.sub(rf"\b({'|'.join(sorted(NAMES, key=len, reverse=True))})\b", r"its_\1", DESCRIPTION)
+    """The Calliope's description with other names for all links and joints. `[[camera]]` is a table."""
+    return re.sub(rf"(?<!\[\[)\b({'|'.join(sorted(NAMES, key=len, reverse=True))})\b", r"its_\1", DESCRIPTION)
 
 
 def on_one_line(description: str) -> str:
