@@ -12,7 +12,8 @@ from mcap.records import ChunkIndex
 
 from cocoro.capture.mcap import ChunkHead
 from services.capture.chunk_index import WAITING_BYTES, ChunkIndices
-from services.capture.file import packed
+from services.capture.file import CaptureFile, packed
+from services.capture.packing import Packer
 
 HEAD = ChunkHead(start_ns=1, end_ns=2, raw_bytes=900, crc=7, compression="zstd", packed_bytes=400)
 OFFSETS = {3: 5_000, 9: 5_060}
@@ -71,3 +72,15 @@ def test_a_full_disk_loses_none_of_them(tmp_path: Path, monkeypatch: pytest.Monk
     add(indices, 1_000)
     assert indices.all() == b"".join(packed(record(at)) for at in [*range(2_000), 0, *range(1_000)])
     indices.close()
+
+
+def test_a_file_that_cannot_be_begun_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_fd: int, _parts: object) -> int:
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(os, "writev", full)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with pytest.raises(OSError, match="no space"):
+        CaptureFile(tmp_path / "a.mcap", Packer("zstd"))
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert list(tmp_path.iterdir()) == []

@@ -83,7 +83,11 @@ class CaptureFile:
         """Schemas and channels to write at the start of the next chunk."""
         try:
             self._chunks = ChunkIndices(path.parent)
-            self._write([mcap.MAGIC, packed(Header(profile, LIBRARY))])
+            try:
+                self._write([mcap.MAGIC, packed(Header(profile, LIBRARY))])
+            except OSError:
+                self._chunks.close()
+                raise
         except OSError:
             os.close(self._fd)
             path.unlink()
