@@ -6,7 +6,7 @@ neck turns the body itself, so its pan is the heading of the camera in the odome
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import asin, atan2, cos, inf, pi, sin, tan
 from typing import Protocol
 
@@ -27,6 +27,8 @@ _STILL_RADPS = 0.1
 """A base that turns more slowly shows no more blur than a head at rest."""
 
 Direction = tuple[float, float]
+Hull = tuple[FloatArray, FloatArray]
+"""Centres (n, 3), body frame, m, and radii (n,), m, of balls."""
 
 
 class Here(Protocol):
@@ -89,9 +91,9 @@ class Gaze(Protocol):
         """Mark the places on the floor, by bearing, rad, and distance, m, each (n,), body frame, that it cannot see
         from here; returns shape (n,)."""
 
-    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: Callable[[], Hull]) -> bool:
         """Whether the robot's own arm may hide a part of a thing, body frame, m, with this half of its width and of its
-        height. `hull`: centres, (n, 3), body frame, m, and radii, (n,), m."""
+        height. `hull()`: the arm's centres, (n, 3), body frame, m, and radii, (n,), m."""
 
     def reached(self, aim: Direction, here: Here) -> bool:
         """Whether the camera rests at a direction."""
@@ -172,7 +174,7 @@ class Neck:
         low, high = self.limits_rad[0]
         return behind_mount(self._robot, np.clip(bearing_rad, low, high), bearing_rad, distance_m)
 
-    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: Callable[[], Hull]) -> bool:
         return False  # a neck stands beside the arm and looks past it
 
     def reached(self, aim: Direction, here: Here) -> bool:
@@ -244,8 +246,8 @@ class BaseAsNeck:
         beyond = (distance_m < self.nearest_m) | (distance_m > self.farthest_m)
         return np.asarray(beyond | behind_mount(self._robot, ahead, ahead, distance_m))
 
-    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: tuple[FloatArray, FloatArray]) -> bool:
-        (centres, radii), (wide_m, high_m) = hull, half_m
+    def hidden(self, centre_m: Vec3, half_m: tuple[float, float], hull: Callable[[], Hull]) -> bool:
+        (centres, radii), (wide_m, high_m) = hull(), half_m
         for up_m in (-high_m, 0.0, high_m):
             way = np.array([*centre_m[:2], centre_m[2] + up_m]) - self._place
             along = np.clip((centres - self._place) @ way / (way @ way), 0.0, 1.0)

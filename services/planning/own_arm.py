@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 from cocoro.objects import ObjectSpec
 from cocoro.robot import Robot
@@ -27,4 +28,4 @@ class OwnArm:
         noted."""
         item = self._known.get(label)
         half_m = (OBJECT_M, OBJECT_M) if item is None else (item.planar_radius_m, item.size_m[2] / 2)
-        return self._gaze.hidden(centre_m, half_m, self._clearance.hull(angles))
+        return self._gaze.hidden(centre_m, half_m, partial(self._clearance.hull, angles))
